@@ -235,15 +235,15 @@ def planar_3rrr(
     Gosselin, Angeles 1988, The optimum kinematic design of a planar three-degree-of-freedom parallel manipulator.
     """
     names = "base_radius - platform_radius, proximal, distal"
-    way, bend = triangle(names, base_radius - platform_radius, proximal, distal)
-    rest = base_radius - platform_radius - way
+    reach, bend = triangle(names, base_radius - platform_radius, proximal, distal)
+    rest = base_radius - platform_radius - reach
     b = ModelBuilder("planar_3rrr", gravity=(0.0, 0.0, 0.0))
     across = platform_mass * platform_radius**2 / 4
     b.add_body("disc", mass=platform_mass, inertia=(across, across, 2 * across))
     b.add_joint("platform", "planar", parent="world", child="disc")
     for k, (c, s) in enumerate(THIRDS, 1):
         # Inwards is (-c, -s), to its left (s, -c).
-        elbow = (-c * way + s * bend, -s * way - c * bend, 0.0)
+        elbow = (-c * reach + s * bend, -s * reach - c * bend, 0.0)
         end = (-c * rest - s * bend, -s * rest + c * bend, 0.0)
         foot, corner = ((c * r, s * r, 0.0) for r in (base_radius, platform_radius))
         for joint, body, length, along, parent, start in (

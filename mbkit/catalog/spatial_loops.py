@@ -227,14 +227,14 @@ def stewart_platform(
                 (platform_radius, middle + side * (pi / 3 - _HALF_PAIR_ANGLE)),
             )
         )
-        way = joint + np.array([0.0, 0.0, height]) - foot
-        x, y, z = (way / 2).tolist()
+        leg = joint + np.array([0.0, 0.0, height]) - foot
+        x, y, z = (leg / 2).tolist()
         for part in ("lower", "upper"):
             add_rod(b, f"{part}{k}", leg_mass, (x, y, z))
         b.add_joint(f"swing{k}", "universal", parent="world", child=f"lower{k}", axis=X, axis2=Y, translation=foot)
-        place: dict[str, Any] = {"axis": way, "translation": way / 2}
+        place: dict[str, Any] = {"axis": leg, "translation": leg / 2}
         b.add_joint(f"length{k}", "prismatic", parent=f"lower{k}", child=f"upper{k}", **place)
-        ends: dict[str, Any] = {"translation_a": way / 2, "translation_b": joint}
+        ends: dict[str, Any] = {"translation_a": leg / 2, "translation_b": joint}
         b.add_loop(f"ball{k}", "point", body_a=f"upper{k}", body_b="platform", **ends)
     return b.build()
 

@@ -158,8 +158,8 @@ def _check_one(
 
 def _confirmed(file: Path) -> bool:
     """Return whether a person at a terminal wants a baseline recorded again."""
-    there = sys.stdin.isatty() and sys.stdout.isatty()
-    return there and click.confirm(f"Record {file} again with these versions?", default=False)
+    interactive = sys.stdin.isatty() and sys.stdout.isatty()
+    return interactive and click.confirm(f"Record {file} again with these versions?", default=False)
 
 
 @shared.command("mbkit baseline diff old.toml new.toml")

@@ -62,10 +62,10 @@ def check(
         options.keys() - {"floating_base"}, True
     )
     if own_parsers and (target is None or any(others.values())):
-        given = [f"--{name.strip('-').replace('_', '-')}" for name, on in others.items() if on]
+        flags = [f"--{name.strip('-').replace('_', '-')}" for name, on in others.items() if on]
         raise click.UsageError(
             "--own-parsers takes one TARGET as it is written, and --engines, --floating-base, --seed, --json and --out"
-            + (f"; not {', '.join(given)}" if given else "")
+            + (f"; not {', '.join(flags)}" if flags else "")
         )
     if everything and (target is not None or "nonphysical" in options):
         raise click.UsageError("--all takes every robot as it is: without a TARGET and without --nonphysical")
@@ -121,13 +121,13 @@ def _of_file(model: Model, target: str) -> Iterator[Finding]:
     if not model.sources:
         return
     try:
-        found = lint(model)
+        findings = lint(model)
     except MbkitError as error:
         yield Finding("the file itself", f"not judged: {error}", (), 0)
         return
-    parts = tuple(dict.fromkeys(row.part for row in found.rows))
-    says = f"no engine judges it: {found.verdict}" + (f"; mbkit lint {target}" if parts else "")
-    yield Finding("the file itself", says, parts, len(found.rows))
+    parts = tuple(dict.fromkeys(row.part for row in findings.rows))
+    says = f"no engine judges it: {findings.verdict}" + (f"; mbkit lint {target}" if parts else "")
+    yield Finding("the file itself", says, parts, len(findings.rows))
 
 
 def _check_parsers(report: Report, target: str, **settings: Any) -> None:

@@ -65,10 +65,10 @@ def derive(
     have the same name, NAME is the catalog's, or paper's where the catalog's has a quaternion or a loop;
     mbkit.catalog:NAME and mbkit.lagrangian.systems:NAME are always the one and the other.
     """
-    given = [name for name, on in forms.items() if on]
-    if len(given) > 1:
-        raise click.UsageError(f"{' and '.join(f'--{name}' for name in given)} exclude each other; give one")
-    form = given[0] if given else None
+    chosen = [name for name, on in forms.items() if on]
+    if len(chosen) > 1:
+        raise click.UsageError(f"{' and '.join(f'--{name}' for name in chosen)} exclude each other; give one")
+    form = chosen[0] if chosen else None
     if as_json and quantity:
         raise click.UsageError("--json and --program exclude each other; --program has --python, --latex and --c")
     if as_json and form:

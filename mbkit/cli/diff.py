@@ -84,8 +84,8 @@ def _beside_terms(first: str, second: str) -> tuple[str, ...]:
         return (f"{missing}, which MuJoCo does not read here ({' '.join(str(error).split())[:120]})",)
     pairs = [sorted((x.tag, *x.attributes.items()) for c in f.root.all("contact") for x in c.children) for f in files]
     out += ("pairs and exclusions of contact",) if pairs[0] != pairs[1] else ()
-    lost = any(tag in ("mesh", "hfield") for f in files for tag, _ in f.gone)
-    return out or (("not compared: contacts of meshes",) if lost else ())
+    lost_shapes = any(tag in ("mesh", "hfield") for f in files for tag, _ in f.gone)
+    return out or (("not compared: contacts of meshes",) if lost_shapes else ())
 
 
 def _model(target: str, options: Mapping[str, Any]) -> Model:

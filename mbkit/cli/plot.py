@@ -70,7 +70,7 @@ def _figure(file: Path, case: str | None) -> Figure:
     except (ValueError, TypeError, RecursionError):
         # Neither text nor JSON.
         pass
-    wanted = "JSON of mbkit stress, for --case"
+    expected = "JSON of mbkit stress, for --case"
     if case is None:
-        wanted = "CSV of mbkit simulate, or the JSON of mbkit check, bench or stress"
-    raise InputError(f"{file}: expected the {wanted}")
+        expected = "CSV of mbkit simulate, or the JSON of mbkit check, bench or stress"
+    raise InputError(f"{file}: expected the {expected}")

@@ -123,14 +123,14 @@ class Compiled:
         many = [sum(x.shape[1] for x in xs if x.strides[0] == 8) > _MAX_STREAMED_ROWS for xs in (inputs, outputs)]
         if not any(many) or last - first <= _BLOCK_SAMPLES:
             return self._run_range(inputs, outputs, first, last)
-        near = [[np.empty((x.shape[1], _BLOCK_SAMPLES)).T for x in xs] for xs in (inputs, outputs)]
+        buffers = [[np.empty((x.shape[1], _BLOCK_SAMPLES)).T for x in xs] for xs in (inputs, outputs)]
         finite = True
         for start in range(first, last, _BLOCK_SAMPLES):
             n = min(_BLOCK_SAMPLES, last - start)
-            for x, y in zip(inputs, near[0], strict=True):
+            for x, y in zip(inputs, buffers[0], strict=True):
                 y[:n] = x[start : start + n]
-            finite &= self._run_range(near[0], near[1], 0, n)
-            for x, y in zip(outputs, near[1], strict=True):
+            finite &= self._run_range(buffers[0], buffers[1], 0, n)
+            for x, y in zip(outputs, buffers[1], strict=True):
                 x[start : start + n] = y[:n]
         return finite
 

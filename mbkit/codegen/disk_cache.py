@@ -134,12 +134,12 @@ def write(key: str, about: dict[str, Any], code: bytes) -> None:
 
 def cached(
     key: str,
-    held: MutableMapping[str, T],
+    in_memory: MutableMapping[str, T],
     restore: Callable[[dict[str, Any], bytes], T],
     make: Callable[[], tuple[dict[str, Any], bytes]],
 ) -> T:
     """Return compiled code: held in this process, from disk, or compiled by `make` now and written."""
-    code = None if is_bypassed(key) else held.get(key)
+    code = None if is_bypassed(key) else in_memory.get(key)
     # An intact entry of another form is compiled again.
     with suppress(KeyError, TypeError, ValueError):
         if code is None and (entry := read(key)):
@@ -148,7 +148,7 @@ def cached(
         new = make()
         write(key, *new)
         code = restore(*new)
-    held[key] = code
+    in_memory[key] = code
     return code
 
 
@@ -159,8 +159,8 @@ def _make_room(at: Path, written: int) -> None:
         _left[at] = left
         return
     entries = []
-    with os.scandir(at) as found:
-        for entry in found:
+    with os.scandir(at) as files:
+        for entry in files:
             with suppress(OSError):
                 if _ENTRY.fullmatch(entry.name):
                     status = entry.stat()

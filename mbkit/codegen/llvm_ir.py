@@ -249,11 +249,11 @@ def _far() -> str:
     # Neighbours in a vector may be small.
     start = op(f"call i64 @llvm.smax.i64(i64 {start}, i64 0)")
     word, shift = op(f"lshr i64 {start}, 6"), op(f"and i64 {start}, 63")
-    held = []
+    loaded = []
     for i in range(4):
         at = op(f"getelementptr i64, ptr @mbkit_two_over_pi, i64 {op(f'add i64 {word}, {i}')}")
-        held.append(op(f"load i64, ptr {at}, align 8"))
-    f = [op(f"call i64 @llvm.fshl.i64(i64 {a}, i64 {b}, i64 {shift})") for a, b in itertools.pairwise(held)]
+        loaded.append(op(f"load i64, ptr {at}, align 8"))
+    f = [op(f"call i64 @llvm.fshl.i64(i64 {a}, i64 {b}, i64 {shift})") for a, b in itertools.pairwise(loaded)]
     last, middle, top = (op(f"mul i128 {wide(m)}, {wide(x)}") for x in reversed(f))
     above = op(f"add i128 {middle}, {wide(high(last))}")
     first = op(f"add i64 {low(top)}, {high(above)}")

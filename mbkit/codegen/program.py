@@ -68,23 +68,23 @@ class Program:
                 return None
             return o.arguments if o.name == "mul" else o.arguments * 2
 
-        taken, made = set[int](), list[Operation]()
+        absorbed, operations = set[int](), list[Operation]()
         for o in self.operations:
             if o.name in ("add", "sub"):
                 a, b = o.arguments
                 if (pair := factors(a)) is not None:
-                    taken.add(a)
+                    absorbed.add(a)
                     o = Operation("fma" if o.name == "add" else "fms", (*pair, b), 0.0)
                 elif (pair := factors(b)) is not None:
-                    taken.add(b)
+                    absorbed.add(b)
                     o = Operation("fma" if o.name == "add" else "fnma", (*pair, a), 0.0)
-            made.append(o)
-        place = np.cumsum([k not in taken for k in range(len(made))]) - 1
-        kept = (o for k, o in enumerate(made) if k not in taken)
-        operations = tuple(
-            o if o.name == "input" else o._replace(arguments=tuple(place[list(o.arguments)].tolist())) for o in kept
+            operations.append(o)
+        place = np.cumsum([k not in absorbed for k in range(len(operations))]) - 1
+        left = (o for k, o in enumerate(operations) if k not in absorbed)
+        packed = tuple(
+            o if o.name == "input" else o._replace(arguments=tuple(place[list(o.arguments)].tolist())) for o in left
         )
-        return Program(self.inputs, self.shapes, operations, tuple(place[out] for out in self.outputs))
+        return Program(self.inputs, self.shapes, packed, tuple(place[out] for out in self.outputs))
 
     @cached_property
     def arithmetic(self) -> int:

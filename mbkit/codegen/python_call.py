@@ -124,14 +124,14 @@ def python_call(
     # The work space begins at a cache line.
     size = 8 * (place + _TABLE) + 64
     counts = [len(inputs), len(results), size, place, len(quaternions), len(steps)]
-    given = [x for name, n in inputs.items() for x in (n, places[name])]
-    made = []
+    sizes = [x for name, n in inputs.items() for x in (n, places[name])]
+    result_places = []
     for name, shape in results.items():
         if prod(shape) != rows[name] or len(shape) > _MAX_AXES:
             raise ValueError(f"{name}: {rows[name]} numbers have no shape {tuple(shape)}")
-        made += [rows[name], places[name], len(shape), *shape, *[1] * (_MAX_AXES - len(shape))]
+        result_places += [rows[name], places[name], len(shape), *shape, *[1] * (_MAX_AXES - len(shape))]
     turns = [places[next(iter(inputs))] + start * width for start in quaternions]
-    lists = [*given, *made, *turns, *calls]
+    lists = [*sizes, *result_places, *turns, *calls]
     numbers = np.array([*_process(), *counts, *lists], dtype=np.int64).view(_Numbers)
     # Threads that are the first together have a definition each, and the cache keeps one.
     definition = _definition()
@@ -213,9 +213,9 @@ def _code() -> str:
     def number(place: int) -> Any:
         return b.get(numbers, _I64(place), _I64)
 
-    def call(address: Any, result: Any, *given: Any) -> Any:
-        kind = ir.FunctionType(result, [x.type for x in given])
-        return b.call(b.inttoptr(address, ir.PointerType(kind)), given)
+    def call(address: Any, result: Any, *arguments: Any) -> Any:
+        kind = ir.FunctionType(result, [x.type for x in arguments])
+        return b.call(b.inttoptr(address, ir.PointerType(kind)), arguments)
 
     width = jit.host().width
     several = _I64(width)
@@ -326,8 +326,8 @@ def _code() -> str:
                 require(is_there(b.load(value, typ=_PTR)), no_memory)
             with is_array:
                 kind, shape = b.inttoptr(number(_ARRAY), _PTR), b.at(result, _I64(3), _I64)
-                given = (b.trunc(axes, _I32), shape, _I32(_NPY_DOUBLE), nothing, nothing, _I32(0), _I32(0), nothing)
-                array = call(number(_NEW_ARRAY), _PTR, kind, *given)
+                arguments = (b.trunc(axes, _I32), shape, _I32(_NPY_DOUBLE), nothing, nothing, _I32(0), _I32(0), nothing)
+                array = call(number(_NEW_ARRAY), _PTR, kind, *arguments)
                 b.store(array, value)
                 require(is_there(array), no_memory)
                 data = b.get(array, _I64(_DATA), _PTR)

@@ -71,8 +71,8 @@ _HELD: Final[WeakValueDictionary[str, CompiledStepLoop]] = WeakValueDictionary()
 
 
 def _compile(parts: Sequence[Part], state: Sequence[str]) -> tuple[dict[str, Any], bytes]:
-    made = {part.name: part.make for part in parts}
-    programs = {name: jit.host().lowered(program(make())) for name, make in made.items()}
+    makers = {part.name: part.make for part in parts}
+    programs = {name: jit.host().lowered(program(make())) for name, make in makers.items()}
     rows, size = _rows(parts, programs, state)
     written = {part.name: _function(part, programs[part.name], rows, size) for part in parts}
     size += max(work for _, work in written.values())
@@ -110,14 +110,14 @@ def _rows(
     return rows, starts[-1]
 
 
-def _function(part: Part, made: Program, rows: dict[str, tuple[int, int]], size: int) -> tuple[str, int]:
+def _function(part: Part, code: Program, rows: dict[str, tuple[int, int]], size: int) -> tuple[str, int]:
     """Return the code of one part, a function of the arena and of where its results go, and its rows of work space."""
-    pieces = pieces_of(made)
-    slots = slots_of(made, pieces)
+    pieces = pieces_of(code)
+    slots = slots_of(code, pieces)
     names = [f"{_NAME}_{part.name}_{k}" for k in range(len(pieces))]
     texts = []
     for k, piece in enumerate(pieces):
-        one = _Placed(made, piece, [rows[name][0] for name in part.reads], size)
+        one = _Placed(code, piece, [rows[name][0] for name in part.reads], size)
         one.write(slots, first=k == 0)
         texts.append(one.function(names[k]))
     calls = "\n".join(f"  call void @{name}(ptr %arena, ptr %out)" for name in names)
@@ -128,10 +128,10 @@ def _function(part: Part, made: Program, rows: dict[str, tuple[int, int]], size:
 class _Placed(Piece):
     """A piece whose arguments, results and work space have fixed places."""
 
-    def __init__(self, made: Program, piece: list[int], reads: list[int], work: int) -> None:
-        super().__init__(made, piece, width())
+    def __init__(self, code: Program, piece: list[int], reads: list[int], work: int) -> None:
+        super().__init__(code, piece, width())
         self._reads, self._start = reads, work
-        self._writes = [0, *accumulate(out.size for out in made.outputs)]
+        self._writes = [0, *accumulate(out.size for out in code.outputs)]
         self.store_zeros()
 
     def _place(self, arrays: str, strides: str, i: int, j: int) -> str:  # noqa: ARG002  # rows are all alike

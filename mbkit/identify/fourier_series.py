@@ -252,10 +252,10 @@ class _Search:
             progress.update(done / max(iterations, 1))
 
         if iterations:
-            found = minimize(
+            minimum = minimize(
                 self.gradient, best.ravel(), jac=True, method="L-BFGS-B", callback=step, options={"maxiter": iterations}
             )
-            best = found.x.reshape(self._shape)
+            best = minimum.x.reshape(self._shape)
         return np.asarray(best)
 
 

@@ -56,7 +56,7 @@ class Fit:
     noise: Array
 
 
-def fit(given: Sequence[Equations], start: Array, units: Array, *, weighted: bool) -> Fit:
+def fit(equations: Sequence[Equations], start: Array, units: Array, *, weighted: bool) -> Fit:
     """Solve the equations.
 
     Parameters
@@ -70,46 +70,46 @@ def fit(given: Sequence[Equations], start: Array, units: Array, *, weighted: boo
     weighted : bool
         Whether the equations have their weights already; else those of their noise are found.
     """
-    noise = np.ones(len(given))
+    noise = np.ones(len(equations))
     for _ in range(_MAX_REWEIGHTINGS):
-        solution = _Solution(given, noise, start, units)
-        found = solution.residual_noise()
+        solution = _Solution(equations, noise, start, units)
+        residuals = solution.residual_noise()
         if weighted:
             break
-        before, noise = noise, _weighing(found, given)
+        before, noise = noise, _weighing(residuals, equations)
         if np.abs(noise / before - 1).max(initial=0.0) < _VARIANCE_CHANGE:
             break
     null = solution.null
     # Rounding of a sum of equations moves the estimates together, unlike noise of each.
-    rounding = _EPS * max((x.count**0.5 * x.size for x in given), default=0.0)
-    deviations = np.where(null.any(axis=0), np.inf, solution.deviations(np.maximum(found, rounding)))
-    return Fit(solution.values, deviations, null, solution.condition, found)
+    rounding = _EPS * max((x.count**0.5 * x.size for x in equations), default=0.0)
+    deviations = np.where(null.any(axis=0), np.inf, solution.deviations(np.maximum(residuals, rounding)))
+    return Fit(solution.values, deviations, null, solution.condition, residuals)
 
 
-def stacked(given: Sequence[Equations], noise: Array) -> Array:
+def stacked(equations: Sequence[Equations], noise: Array) -> Array:
     """Return all equations, each over its noise, as one triangular system, (m, p + 1)."""
-    out: Array = np.vstack([x.factor / s for x, s in zip(given, noise, strict=True)])
+    out: Array = np.vstack([x.factor / s for x, s in zip(equations, noise, strict=True)])
     return np.asarray(np.linalg.qr(out, mode="r")) if len(out) > out.shape[1] else out
 
 
-def _weighing(noise: Array, given: Sequence[Equations]) -> Array:
+def _weighing(noise: Array, equations: Sequence[Equations]) -> Array:
     """Return the noise that weighs: no less than rounding, nor so small that the other equations would not count."""
-    rounding = _EPS * (max((x.size for x in given), default=0.0) or 1.0)
+    rounding = _EPS * (max((x.size for x in equations), default=0.0) or 1.0)
     return np.maximum(noise, max(rounding, MIN_NOISE_RATIO * float(noise.max(initial=0.0))))
 
 
 class _Solution:
     """The least squares for noise that is given."""
 
-    def __init__(self, given: Sequence[Equations], noise: Array, start: Array, units: Array) -> None:
-        self._given, self._noise = given, noise
-        system = stacked(given, noise)
+    def __init__(self, equations: Sequence[Equations], noise: Array, start: Array, units: Array) -> None:
+        self._given, self._noise = equations, noise
+        system = stacked(equations, noise)
         A, b = system[:, :-1], system[:, -1]
         lengths = np.linalg.norm(A, axis=0)
         natural = lengths / units
-        seen = natural > SINGULAR_VALUE_RATIO * natural.max(initial=0.0)
-        scale = np.where(seen, lengths, 1.0)
-        U, sizes, axes = np.linalg.svd(np.where(seen, A / scale, 0.0))
+        observable = natural > SINGULAR_VALUE_RATIO * natural.max(initial=0.0)
+        scale = np.where(observable, lengths, 1.0)
+        U, sizes, axes = np.linalg.svd(np.where(observable, A / scale, 0.0))
         rank = int(np.sum(sizes > SINGULAR_VALUE_RATIO * sizes.max(initial=0.0)))
         self.condition = float(sizes[0] / sizes[rank - 1]) if rank else np.nan
         #: Parameters of each unit of the directions that the data can tell.
@@ -119,9 +119,9 @@ class _Solution:
 
     def residual_noise(self) -> Array:
         """Return the standard deviation of each velocity's residuals, less the freedom that parameters took."""
-        given, noise = self._given, self._noise
-        squares = np.array([np.sum((x.factor[:, :-1] @ self.values - x.factor[:, -1]) ** 2) for x in given])
-        left = np.array([x.count - np.sum(part**2) for x, part in zip(given, self._parts(), strict=True)])
+        equations, noise = self._given, self._noise
+        squares = np.array([np.sum((x.factor[:, :-1] @ self.values - x.factor[:, -1]) ** 2) for x in equations])
+        left = np.array([x.count - np.sum(part**2) for x, part in zip(equations, self._parts(), strict=True)])
         # A velocity with next to no freedom left takes the noise of all of them.
         shared = np.sum(squares / noise**2) / max(float(left.sum()), 1.0)
         return np.asarray(np.sqrt(np.where(left >= 1.0, squares / np.maximum(left, 1.0), shared * noise**2)))
@@ -140,6 +140,6 @@ def _directions(null: Array, scale: Array) -> Array:
     """Return directions in units of the parameters, with an identity matrix among their columns."""
     if not len(null):
         return null
-    gone, unit = eliminated(null)
+    eliminated_columns, unit = eliminated(null)
     unit[np.abs(unit) < _DIRECTION_ENTRY_RATIO * np.abs(unit).max(axis=1, keepdims=True)] = 0.0
-    return np.asarray(unit * scale[gone, None] / scale)
+    return np.asarray(unit * scale[eliminated_columns, None] / scale)

@@ -99,9 +99,9 @@ class Measurements:
         """
         if not jumps.any():
             return self
-        kept = moving(self.v, rest) | ~jumps
+        used = moving(self.v, rest) | ~jumps
         weights = np.ones(self.v.shape) if self.weights is None else self.weights
-        return self if kept.all() else replace(self, weights=np.asarray(weights * kept))
+        return self if used.all() else replace(self, weights=np.asarray(weights * used))
 
     def __len__(self) -> int:
         return len(self.tau)

@@ -129,8 +129,8 @@ def filtered_motion(
     if tau is not None:
         forces = sosfiltfilt(sections, finite_array("tau", tau, (len(raw), model.nv)), axis=0)
     # A filtered signal has two independent samples a period of its cut-off: more would count one error often.
-    kept = slice(edge, len(raw) - edge, max(1, int(0.5 / (cutoff * dt))))
-    return FilteredMotion(smooth[kept], v[kept], a[kept], None if forces is None else forces[kept], kept, cutoff, dt)
+    used = slice(edge, len(raw) - edge, max(1, int(0.5 / (cutoff * dt))))
+    return FilteredMotion(smooth[used], v[used], a[used], None if forces is None else forces[used], used, cutoff, dt)
 
 
 def motion_noise(data: Measurements) -> tuple[Array, Array]:
@@ -172,11 +172,11 @@ def bias(
     draws = [sign * x for x in halves for sign in (1.0, -1.0)]
 
     def noisy(times: float) -> tuple[Array, Array]:
-        found = []
+        values = []
         for draw in draws:
             e = np.sqrt(times) * draw
-            found.append(solve(replace(data, v=data.v + e[:, :nv], a=data.a + e[:, nv:])))
-        return np.mean([x for x, _ in found], axis=0), np.mean([s for _, s in found], axis=0)
+            values.append(solve(replace(data, v=data.v + e[:, :nv], a=data.a + e[:, nv:])))
+        return np.mean([x for x, _ in values], axis=0), np.mean([s for _, s in values], axis=0)
 
     (once, more), (twice, _) = noisy(1.0), noisy(2.0)
     # Curvature of an exact motion is no noise: noise of this size would be in the residuals too.

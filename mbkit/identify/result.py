@@ -184,17 +184,17 @@ class Identification(ResultTable):
         raise ModelError(model.name, [*faults, hint])
 
     def _joints(self, model: Model) -> tuple[Joint, ...]:
-        found = {p.name: p for p in self.parameters}
+        estimates = {p.name: p for p in self.parameters}
         out = []
         for joint in model.joints:
             changes: dict[str, Any] = {}
             for field in chain(*OF_JOINTS):
                 names = [f"{n}.{field}" for n in model.velocity_names[model.layout.v[joint.name]]]
-                if names and names[0] in found:
-                    beside = getattr(joint, field) - model.per_velocity(field)[model.layout.v[joint.name]]
-                    values = np.array([found[n].value for n in names]) + beside
+                if names and names[0] in estimates:
+                    offset = getattr(joint, field) - model.per_velocity(field)[model.layout.v[joint.name]]
+                    values = np.array([estimates[n].value for n in names]) + offset
                     # Rounding and noise of what is zero have any sign.
-                    deviations = np.array([found[n].deviation if found[n].determined else 0.0 for n in names])
+                    deviations = np.array([estimates[n].deviation if estimates[n].determined else 0.0 for n in names])
                     insignificant = (values < 0) & (values >= -SIGNIFICANT_DEVIATIONS * deviations)
                     changes[field] = np.where(insignificant, 0.0, values)
             out.append(replace(joint, **changes) if changes else joint)
@@ -206,14 +206,14 @@ class Identification(ResultTable):
         return {name: x for name, x in data.items() if name != "source"}
 
     def __repr__(self) -> str:
-        lost = f", {len(self.undetermined)} directions undetermined" if self.undetermined else ""
+        undetermined = f", {len(self.undetermined)} directions undetermined" if self.undetermined else ""
         size = f"{len(self.parameters)} parameters of {self.samples} samples"
-        return f"<Identification of {self.model_name!r}: {size}{lost}>"
+        return f"<Identification of {self.model_name!r}: {size}{undetermined}>"
 
     def __str__(self) -> str:
-        told = [p for p in self.parameters if p.determined]
-        worst = max(told, key=lambda p: p.relative, default=None)
-        biased = max(told, key=lambda p: abs(p.bias) / p.deviation if p.deviation else 0.0, default=None)
+        determined = [p for p in self.parameters if p.determined]
+        worst = max(determined, key=lambda p: p.relative, default=None)
+        biased = max(determined, key=lambda p: abs(p.bias) / p.deviation if p.deviation else 0.0, default=None)
         lines = [f"{self.model_name}: {len(self.parameters)} parameters of {self.samples} samples"]
         lines += [f"  condition {self.condition:.3g}" + (f", cut-off {self.cutoff:g} Hz" if self.cutoff else "")]
         if worst:

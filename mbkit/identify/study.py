@@ -179,12 +179,12 @@ def identify(
 
 
 def _require_enough(model: Model, unknowns: Unknowns, data: Measurements) -> None:
-    wanted = -(-len(unknowns.names) // max(model.nv, 1))
+    needed = -(-len(unknowns.names) // max(model.nv, 1))
     if not unknowns.names:
         raise InputError(f"model: expected one whose motion depends on inertial parameters, got {model.name}")
-    if len(data) < wanted:
+    if len(data) < needed:
         size = f"{len(unknowns.names)} parameters and {model.nv} torques a sample"
-        raise InputError(f"samples: expected at least {wanted}, for {size}, got {len(data)}")
+        raise InputError(f"samples: expected at least {needed}, for {size}, got {len(data)}")
 
 
 def _units(model: Model, unknowns: Unknowns, length: float) -> Array:

@@ -150,19 +150,19 @@ class SymbolicKinematics(Kinematics):
         """D v, the coordinates' rates in the velocities."""
         return list(self.velocity_matrix * sp.Matrix(self.rates))
 
-    def quasi_velocities(self, kept: list[int]) -> QuasiVelocities | None:
+    def quasi_velocities(self, independent: list[int]) -> QuasiVelocities | None:
         """Return how the velocities of these coordinates give their rates; None where they are the rates."""
         if not self._charted:
             return None
-        D, n = sp.ImmutableMatrix(self.velocity_matrix.extract(kept, kept)), len(kept)
+        D, n = sp.ImmutableMatrix(self.velocity_matrix.extract(independent, independent)), len(independent)
         gamma = sp.MutableDenseNDimArray.zeros(n, n, n)
         for joint in self._charted:
             units = np.eye(joint.type.nv, dtype=int).tolist()
-            first = kept.index(self.model.layout.v[joint.name].start)
+            first = independent.index(self.model.layout.v[joint.name].start)
             for (j, v), (k, p) in product(enumerate(units), repeat=2):
                 for i, x in enumerate(joint.type.hamel(v, p)):
                     gamma[first + k, first + i, first + j] = sp.nsimplify(x)
-        q = tuple(self.symbols[i] for i in kept)
+        q = tuple(self.symbols[i] for i in independent)
         none = sp.ImmutableMatrix.zeros(n, 1)
         out = QuasiVelocities(D, inverse(D, "D"), q, tuple(map(velocity_of, q)), none, none)
         # Joint types know theirs, which brackets of D's columns would give again.
@@ -383,15 +383,17 @@ def rolling(kin: SymbolicKinematics, part: NoSlip) -> tuple[list[sp.Expr], list[
     at = [c + o for c, o in zip(centre, place.offset, strict=True)]
     speeds = [material(way, point, at) for way, point in zip(ways, (centre, ground), strict=True)]
     gap, velocity = ([c - d for c, d in zip(*two, strict=True)] for two in ((centre, ground), speeds))
-    held, moving = ([tidy(row) for row in rows] for rows in place.rows(gap, velocity, x.speed))
-    held, moving = ([x for x in rows if not (x.is_number and abs(x) < _CLOSING_GAP_RATIO)] for rows in (held, moving))
-    still = [row for row in (*held, *moving) if not row.free_symbols & {*kin.symbols, *kin.rates}]
-    if still or not (held or moving):
+    both = [[tidy(row) for row in rows] for rows in place.rows(gap, velocity, x.speed)]
+    position_rows, velocity_rows = (
+        [x for x in rows if not (x.is_number and abs(x) < _CLOSING_GAP_RATIO)] for rows in both
+    )
+    still = [row for row in (*position_rows, *velocity_rows) if not row.free_symbols & {*kin.symbols, *kin.rates}]
+    if still or not (position_rows or velocity_rows):
         raise InputError(
             f"{kin.model.name}: no slip {part.name!r}: "
             + (f"{still[0]} is left, whatever the joints do" if still else "no joint moves it; leave it out")
         )
-    return held, moving
+    return position_rows, velocity_rows
 
 
 def written_rows(kin: SymbolicKinematics, part: Any) -> tuple[list[sp.Expr], list[sp.Expr]]:
@@ -431,20 +433,20 @@ def closure(kin: SymbolicKinematics, loop: Loop) -> list[sp.Expr]:
         [kin.carried(way, [row[k] for row in R], 0) for k in range(3)] if turned else []
         for way, R in zip(ends, (values.rotation_a, values.rotation_b), strict=True)
     )
-    held = LoopEnds([x - y for x, y in zip(*points, strict=True)], frame_a, frame_b, values.length)
+    loop_ends = LoopEnds([x - y for x, y in zip(*points, strict=True)], frame_a, frame_b, values.length)
     apart = "its axes never cross at a right angle" if loop.kind == CROSSED else "its frames are never parallel"
     told = ("its points never meet", apart)
     messages = [f"loop {loop.name!r}: {told[name in TURNING]}" for name in names]
     axes = [axis for way in ends for axis in _axes(way)] if loop.kind in WELDED else []
     if loop.kind in WELDED and all(np.linalg.norm(np.cross(axis, axes[0])) < DEPENDENT for axis in axes):
-        rows = _independent(kin, rows_of(held)[: -len(held.turn())], messages)
+        rows = _independent(kin, rows_of(loop_ends)[: -len(loop_ends.turn())], messages)
         rows += _in_plane(kin, loop, ends, axes[0] if axes else None, messages[-1])
     elif names == LOOP_ROWS["distance"][0]:
         # A sum of cosines has no quotients.
         length = kin.written.values.of(loop).length
-        rows = [x / (2 * length) for x in _independent(kin, [held.excess()], messages)]
+        rows = [x / (2 * length) for x in _independent(kin, [loop_ends.excess()], messages)]
     else:
-        rows = _independent(kin, rows_of(held), messages)
+        rows = _independent(kin, rows_of(loop_ends), messages)
     if not rows:
         raise InputError(
             f"{kin.model.name}: loop {loop.name!r} closes nothing: no joint moves its ends against each other; "
@@ -506,17 +508,17 @@ def _independent(kin: SymbolicKinematics, sums: list[TrigPolynomial], messages: 
     moving = np.array([kin.moves(key) for key in keys], dtype=bool)
     A = np.array([[float(x.terms.get(key, 0)) for key in keys] for x in sums]).reshape(len(sums), len(keys))
     largest = float(np.abs(A).max(initial=0.0))
-    kept: list[int] = []
+    pivots: list[int] = []
     if moving.any():
         sizes = np.linalg.norm(A[:, moving], axis=1)
         # Metres and radians do not compare.
         scale = np.where(sizes > DEPENDENT * sizes.max(), sizes, np.inf)[:, None]
-        kept = sorted(pivoted(A[:, moving] / scale)[0])
-    for i in sorted({*range(len(sums))} - {*kept}):
-        weights = np.linalg.lstsq(A[kept][:, moving].T, A[i, moving], rcond=None)[0]
-        left = A[i] - weights @ A[kept]
+        pivots = sorted(pivoted(A[:, moving] / scale)[0])
+    for i in sorted({*range(len(sums))} - {*pivots}):
+        weights = np.linalg.lstsq(A[pivots][:, moving].T, A[i, moving], rcond=None)[0]
+        left = A[i] - weights @ A[pivots]
         if np.abs(left[~moving]).max(initial=0.0) > _CLOSING_GAP_RATIO * largest:
             rest = kin.shown(TrigPolynomial(kin.formulas, {k: x for k, x in sums[i].terms.items() if not kin.moves(k)}))
             why = f": {f'{float(rest):.6g}' if rest.is_number else rest} is left between them"
             raise InputError(f"{kin.model.name}: {messages[i]}, whatever the joints do{'' if weights.any() else why}")
-    return [kin.shown(sums[i]) for i in kept]
+    return [kin.shown(sums[i]) for i in pivots]

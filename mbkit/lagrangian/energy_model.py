@@ -52,16 +52,16 @@ class EnergyModel(Model):
     """
 
     def __init__(self, form: EnergyForm, values: Mapping[str, float | None] | None = None) -> None:
-        held = form.quasi.D.free_symbols - set(form.coordinates) if form.quasi is not None else set()
-        if form.quasi is not None and (any(form.quasi.drift) or form.clock in held):
+        rate_symbols = form.quasi.D.free_symbols - set(form.coordinates) if form.quasi is not None else set()
+        if form.quasi is not None and (any(form.quasi.drift) or form.clock in rate_symbols):
             raise UnsupportedError(
                 f"quasi_velocities: {form.name} runs with q̇ = D(q) w, without time in D and without drift; run its "
                 ".system, the same in the coordinates' rates, and read w by to_quasi_velocity"
             )
-        if held:
+        if rate_symbols:
             raise UnsupportedError(
-                f"D: to run, it must hold coordinates and numbers only, but it holds {plain(held)}; "
-                f"put numbers in first: substituted({{{min(held, key=str)}: ...}})"
+                f"D: to run, it must hold coordinates and numbers only, but it holds {plain(rate_symbols)}; "
+                f"put numbers in first: substituted({{{min(rate_symbols, key=str)}: ...}})"
             )
         bodies, joints = abstract_parts([q.name for q in form.coordinates])
         # The parts of a frozen class are set once, here.
@@ -158,8 +158,8 @@ class EnergyModel(Model):
         moved = {n: real(f"parameter {n!r}", x) for n, x in values.items()}
         out = object.__new__(type(self))
         # Nothing but the values differs: what was derived from the rest is kept.
-        kept = {k: x for k, x in self.__dict__.items() if k not in ("parameters", "digest")}
-        out.__dict__.update(kept, _values={**self._values, **moved})
+        attributes = {k: x for k, x in self.__dict__.items() if k not in ("parameters", "digest")}
+        out.__dict__.update(attributes, _values={**self._values, **moved})
         return out
 
     def with_parameters(self, /, **values: float) -> EnergyModel:

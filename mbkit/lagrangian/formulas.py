@@ -32,7 +32,7 @@ _INSTEAD: Final = (
 
 
 def read_formula(
-    parts: Sequence[tuple[Any, int | None]], given: Sequence[str | Sequence[str]], things: list[Expression]
+    parts: Sequence[tuple[Any, int | None]], signature: Sequence[str | Sequence[str]], things: list[Expression]
 ) -> Formula:
     """Return expressions, one behind the other, as a formula of their symbols.
 
@@ -54,7 +54,7 @@ def read_formula(
     """
     entries: list[Any] = []
     for value, size in parts:
-        own = [_scalar(x, things) for x in _entries(_called(value, given))]
+        own = [_scalar(x, things) for x in _entries(_called(value, signature))]
         if size is not None and len(own) != size:
             raise InputError(f"expected {size} {'number' if size == 1 else 'numbers'}, got {len(own)}")
         entries += own
@@ -101,11 +101,11 @@ def _is_sympy(value: Any) -> bool:
     return sp is not None and isinstance(value, (sp.Basic, sp.MatrixBase))
 
 
-def _called(value: Any, given: Sequence[str | Sequence[str]]) -> Any:
+def _called(value: Any, signature: Sequence[str | Sequence[str]]) -> Any:
     """Return what a function returns for symbols; other objects as they are."""
     if not callable(value) or isinstance(value, (Expression, ca.SX, ca.MX, ca.DM)) or _is_sympy(value):
         return value
-    symbols = [_symbol(n) if isinstance(n, str) else ca.vertcat(*(ca.SX.sym(x) for x in n)) for n in given]
+    symbols = [_symbol(n) if isinstance(n, str) else ca.vertcat(*(ca.SX.sym(x) for x in n)) for n in signature]
     try:
         # CasADi warns of NumPy's functions on its symbols, which give the expression that is meant.
         with warnings.catch_warnings():
@@ -192,8 +192,8 @@ def read_spline(value: Any, ends: Ends) -> tuple[Array, Array] | None:
     if isinstance(value, BSpline):
         first, last = value.t[value.k], value.t[len(value.t) - value.k - 1]
         pieces = PPoly.from_spline(value)
-        kept = (np.diff(pieces.x) > 0) & (pieces.x[:-1] >= first) & (pieces.x[1:] <= last)
-        value = PPoly(pieces.c[:, kept], np.append(pieces.x[:-1][kept], last))
+        inner = (np.diff(pieces.x) > 0) & (pieces.x[:-1] >= first) & (pieces.x[1:] <= last)
+        value = PPoly(pieces.c[:, inner], np.append(pieces.x[:-1][inner], last))
     if not isinstance(value, PPoly):
         return None
     if value.c.ndim != 2 or np.iscomplexobj(value.c):

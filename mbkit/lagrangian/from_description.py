@@ -151,18 +151,18 @@ def from_model(
         pushed = [x - size * sp.sign(rate) * sp.diff(rate, w) for x, w in zip(pushed, v, strict=True)]
     T, V, R, *constraints = (x.xreplace(put) for x in (T, V + stored, R, *(row for _, row in rows)))
     pushed, moving = ([x.xreplace(put) for x in found] for found in (pushed, moving))
-    kept = [i for i in range(len(q)) if i not in moved]
+    independent = [i for i in range(len(q)) if i not in moved]
     # Dampers on prescribed joints alone act on no coordinate that is left.
-    R = R if R.free_symbols & {v[i] for i in kept} else sp.Integer(0)
-    _check_kept(model, {q[i] for i in kept}, zip((name for name, _ in rows), constraints, strict=True))
+    R = R if R.free_symbols & {v[i] for i in independent} else sp.Integer(0)
+    _check_kept(model, {q[i] for i in independent}, zip((name for name, _ in rows), constraints, strict=True))
     used = set().union(*(x.free_symbols for x in (T, V, R, *constraints, *moving, *pushed)))
     arguments = {
         "T": T,
         "V": V,
-        "coordinates": [q[i] for i in kept],
-        "velocities": [v[i] for i in kept],
+        "coordinates": [q[i] for i in independent],
+        "velocities": [v[i] for i in independent],
         "time": t,
-        "forces": {q[i]: pushed[i] for i in kept if pushed[i] != 0},
+        "forces": {q[i]: pushed[i] for i in independent if pushed[i] != 0},
         "dissipation": R,
         "constraints": constraints,
         "velocity_constraints": moving,
@@ -170,7 +170,7 @@ def from_model(
         "parameters": {s: source.parameters[n] for n, s in parameters.items() if named is None or s in used} | g,
         "name": model.name,
     }
-    quasi = kin.quasi_velocities(kept)
+    quasi = kin.quasi_velocities(independent)
     return Lagrangian(**arguments) if quasi is None else QuasiLagrangian.of_energies(quasi, **arguments)
 
 
@@ -215,11 +215,11 @@ def _weight(kin: SymbolicKinematics, used: set[str]) -> tuple[sp.Expr, dict[sp.S
 
 def _too_much(model: Model) -> Iterator[str]:
     turning = [j.name for j in model.independent_joints if not j.type.coordinate_velocities]
-    held = dict.fromkeys(x.section for x in model.constraints if type(x) not in MOTION_LAWS)
-    if turning and held:
+    sections = dict.fromkeys(x.section for x in model.constraints if type(x) not in MOTION_LAWS)
+    if turning and sections:
         yield (
             f"joint {turning[0]!r} has velocities that are no coordinate's rate, and is not written out beside "
-            f"{' and '.join(held)}; write it as three joints of one coordinate each, or as spherical_zyx"
+            f"{' and '.join(sections)}; write it as three joints of one coordinate each, or as spherical_zyx"
         )
     if not model.nv:
         yield "no joint of it moves, so there is no equation"
@@ -247,15 +247,15 @@ def _time(used: set[str]) -> sp.Symbol:
     return sp.Symbol(next(name for name in names if name not in used))
 
 
-def _check_kept(model: Model, kept: set[sp.Symbol], rows: Iterable[tuple[str, sp.Expr]]) -> None:
+def _check_kept(model: Model, names: set[sp.Symbol], rows: Iterable[tuple[str, sp.Expr]]) -> None:
     """Refuse what the prescribed motions leave nothing of."""
-    if not kept:
+    if not names:
         raise UnsupportedError(
             f"{model.name}: every coordinate is prescribed, so there is no equation; drives=True keeps them, with the "
             "forces that move them as multipliers"
         )
     for name, row in rows:
-        if not row.free_symbols & kept:
+        if not row.free_symbols & names:
             raise InputError(
                 f"{model.name}: loop {name!r}: the prescribed motions alone move it, so that it is open or "
                 f"says nothing: {row} = 0; leave out one of them"

@@ -146,8 +146,8 @@ class Lagrangian(EnergyForm):
         """
         momenta = {q: (f"p_{q.name}", p) for q, p in self.conserved_momenta().items()}
         name = "E" if hamilton.is_energy(self._given) else "h"
-        found = hamilton.conserved_quantities(self._given, momenta, name, self.energy_function, self.velocities)
-        return found if self.quasi is not None or not self.multiplier_symbols else (*found, *symmetry_momenta(self))
+        out = hamilton.conserved_quantities(self._given, momenta, name, self.energy_function, self.velocities)
+        return out if self.quasi is not None or not self.multiplier_symbols else (*out, *symmetry_momenta(self))
 
     @property
     def energy_function(self) -> sp.Expr:
@@ -492,13 +492,13 @@ class QuasiLagrangian(Lagrangian):
         forces = self.W.T * sp.Matrix(acting_forces(self))
         # The derivative of L at constant rates of the coordinates.
         slopes = (sp.diff(self.L, q) + (p.T * sp.diff(self.W, q) * rates)[0] for q in self.coordinates)
-        found = zip(self.coordinates, slopes, forces, strict=True)
-        return {q: tidy(force) for q, slope, force in found if vanish([slope])}
+        candidates = zip(self.coordinates, slopes, forces, strict=True)
+        return {q: tidy(force) for q, slope, force in candidates if vanish([slope])}
 
     def conserved_momenta(self) -> dict[sp.Symbol, sp.Expr]:
         """Return the momentum Wᵀ p of each cyclic coordinate, in quasi-velocities."""
-        p, kept = self.W.T * self.momenta, self.cyclic_coordinates()
-        return {q: tidy(x) for q, x in zip(self.coordinates, p, strict=True) if q in kept}
+        p, cyclic = self.W.T * self.momenta, self.cyclic_coordinates()
+        return {q: tidy(x) for q, x in zip(self.coordinates, p, strict=True) if q in cyclic}
 
     @property
     def energy_function(self) -> sp.Expr:
@@ -519,9 +519,9 @@ class QuasiLagrangian(Lagrangian):
         return {name: Numeric(A, *arguments) for name, A in maps.items()}
 
     def _mapped(self, name: str, q: ArrayLike, x: ArrayLike, t: float, values: dict[str, float]) -> Array:
-        n, held = len(self.coordinates), (self.D.free_symbols | self.drift.free_symbols) & set(self.parameters)
+        n, own = len(self.coordinates), (self.D.free_symbols | self.drift.free_symbols) & set(self.parameters)
         q, x = rows("q", q, n, self.name, "nq"), rows(name, x, n, self.name, "nv")
-        numbers = parameter_values(self, values, name) if held else np.zeros(len(self.parameters))
+        numbers = parameter_values(self, values, name) if own else np.zeros(len(self.parameters))
         timed = numbers if self.time is None else np.array([real("t", t), *numbers])
         A = require_value(self._maps[name](q, timed), self.name, q, "1/det D, or det D,")
         return np.asarray(np.einsum("...ij,...j->...i", A[..., :n], x) + A[..., n:].sum(axis=-1))

@@ -45,16 +45,16 @@ def add_loops(model: Model, loops: Loops) -> Model:
     ModelError
         All faults of the loops in one list: unknown bodies, kinds and wrong numbers.
     """
-    given: Sequence[Any]
+    entries: Sequence[Any]
     if isinstance(loops, (str, os.PathLike)):
-        given, where = read_loops(loops), os.fspath(loops)
+        entries, where = read_loops(loops), os.fspath(loops)
     elif isinstance(loops, Sequence):
-        given, where = loops, "loops"
+        entries, where = loops, "loops"
     else:
         raise InputError(
             f"loops: expected True, False, a TOML file, or a sequence of Loop objects or dicts, got {shown(loops)}"
         )
-    arguments = [_arguments(one, f"{where}[{k}]") for k, one in enumerate(given)]
+    arguments = [_arguments(one, f"{where}[{k}]") for k, one in enumerate(entries)]
     try:
         added = with_loops(model, [_on_bodies(model, one) for one in arguments])
     except ModelError as error:
@@ -95,8 +95,8 @@ def _arguments(one: Any, what: str) -> dict[str, Any]:
     if missing := [name for name, needed in _PARAMETERS.items() if needed and name not in one]:
         kind, absent = one.get("kind"), f"{', '.join(missing)} missing"
         if "kind" in one and not (isinstance(kind, str) and kind in LOOP_KINDS):
-            there = ", ".join(map(repr, LOOP_KINDS))
-            raise InputError(f"{what}: unknown kind {shown(kind)}; there are {there}; and {absent}")
+            kinds = ", ".join(map(repr, LOOP_KINDS))
+            raise InputError(f"{what}: unknown kind {shown(kind)}; there are {kinds}; and {absent}")
         raise InputError(f"{what}: {absent}")
     return dict(one)
 

@@ -199,8 +199,8 @@ def load(
         from mbkit.load.mjcf import model_of_mjcf
 
         whole = xml_reader.with_includes(root, path)
-        wanted = added is not None or bool(loops)
-        model = model_of_mjcf(whole, path, floating_base, policy, gravity, meshes, wanted, bool(actuators))
+        reads_loops = added is not None or bool(loops)
+        model = model_of_mjcf(whole, path, floating_base, policy, gravity, meshes, reads_loops, bool(actuators))
     elif root.tag == "sdf":
         if str(path) != _TEXT and path.suffix.lower() != ".sdf":
             raise LoadError(f"{path}: this is SDF; give its file a name that ends in .sdf")
@@ -372,14 +372,14 @@ def described(name: str) -> Path:
     def importing(what: str, *others: Any) -> Any:
         return SimpleNamespace(clone_to_cache=cached) if what == "_cache" else builtins.__import__(what, *others)
 
-    there: dict[str, Any] = {"__builtins__": vars(builtins) | {"__import__": importing}, "__package__": _DESCRIPTIONS}
+    names: dict[str, Any] = {"__builtins__": vars(builtins) | {"__import__": importing}, "__package__": _DESCRIPTIONS}
     pull = f"python -m {_DESCRIPTIONS} pull {module}"
     try:
-        exec(compile(file.read_text("utf-8"), str(file), "exec"), there)
+        exec(compile(file.read_text("utf-8"), str(file), "exec"), names)
     except OSError:
         # A module that mends its file opens it.
-        there = {}
-    path = Path(there.get("URDF_PATH") or there.get("MJCF_PATH") or there.get("XACRO_PATH") or "")
+        names = {}
+    path = Path(names.get("URDF_PATH") or names.get("MJCF_PATH") or names.get("XACRO_PATH") or "")
     if not path.is_file():
         raise LoadError(f"{name}: its files are not in the cache of {_DESCRIPTIONS}, {cache}; `{pull}` fetches them")
     if path.suffix == ".xacro":

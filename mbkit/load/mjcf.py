@@ -106,8 +106,8 @@ def model_of_mjcf(
         read.fault("no bodies; expected <worldbody> with <body> elements")
     elif not any(b.joints for b in scene.bodies):
         read.fault("no joints, so nothing moves (nq = 0); add a joint, or load with floating_base=True")
-    wanted, total = scene.compiler.settotalmass, sum(b.mass_properties.mass for b in scene.bodies)
-    scale = wanted / total if wanted > 0 and total > 0 else 1.0
+    total_mass, written_mass = scene.compiler.settotalmass, sum(b.mass_properties.mass for b in scene.bodies)
+    scale = total_mass / written_mass if total_mass > 0 and written_mass > 0 else 1.0
     springs = infer_springs(mujoco, path, scene)
     b = ModelBuilder(mujoco.attributes.get("model") or path.stem, gravity=gravity)
     # A body may be below one of its name.
@@ -115,7 +115,7 @@ def model_of_mjcf(
     snap = _Tree(b, scene, springs, off).add_bodies(scale)
     _hold_weights(b, mujoco, scene, off, actuators=actuators)
     transmissions = Transmissions(mujoco, scene, off, servos=actuators)
-    equalities = Equalities(mujoco, scene, off, wanted=loops, tendons=transmissions.factors)
+    equalities = Equalities(mujoco, scene, off, enabled=loops, tendons=transmissions.factors)
     if read.faults:
         raise ModelError(str(path), read.faults)
     sprung = f"stiffness and damping from MuJoCo's compiler (springdamper): {name_list(springs)}" if springs else ""
@@ -374,8 +374,8 @@ def _notes(mujoco: Element, path: Path, scene: Scene, flags: Mapping[str, str], 
     if sections := Counter(s.tag for s in mujoco.children for _ in s.children or [s] if s.tag not in _READ):
         counts = ", ".join(f"{n} {tag}" for tag, n in sorted(sections.items()))
         yield f"sections left out, with whatever they do to the motion: {counts}"
-    if lost := ", ".join(f"{what} ({n})" for what, n in sorted(scene.left_out.items()) if n):
-        yield f"{LEFT_OUT}: {lost}"
+    if left_out := ", ".join(f"{what} ({n})" for what, n in sorted(scene.left_out.items()) if n):
+        yield f"{LEFT_OUT}: {left_out}"
     medium = Element("option", {}, 0)
     for element in mujoco.all("option"):
         medium.attributes |= {k: v for k, v in element.attributes.items() if k in ("density", "viscosity", "wind")}

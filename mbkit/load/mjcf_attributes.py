@@ -163,8 +163,8 @@ class Defaults:
 
 def _over(values: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
     """Return `values` overridden by `own`; any orientation of its own replaces every other."""
-    kept = {k: v for k, v in values.items() if k not in ORIENTATIONS or not ORIENTATIONS.keys() & own.keys()}
-    return {**kept, **own}
+    inherited = {k: v for k, v in values.items() if k not in ORIENTATIONS or not ORIENTATIONS.keys() & own.keys()}
+    return {**inherited, **own}
 
 
 def pose(element: Element, compiler: Compiler, read: Reader, item: str) -> Pose:
@@ -273,18 +273,18 @@ def _check(element: Element, rule: Rule, read: Reader, aside: list[str], acts: b
     for name in element.attributes:
         if name not in rule.attributes:
             unknown("attribute", name, rule.attributes, element)
-    seen: set[str] = set()
+    tags: set[str] = set()
     for child in element.children:
         inner = rule.children.get(child.tag)
         if child.tag in _UNREAD:
             continue
         if inner is None:
             unknown("element", child.tag, frozenset(rule.children), child)
-        elif inner.once and child.tag in seen:
+        elif inner.once and child.tag in tags:
             read.fault(f"{_called(element)}: more than one <{child.tag}>; keep one", child)
         else:
             _check(child, inner, read, aside, acts and child.tag not in _ASIDE)
-        seen.add(child.tag)
+        tags.add(child.tag)
 
 
 def _called(element: Element) -> str:

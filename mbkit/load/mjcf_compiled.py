@@ -101,8 +101,8 @@ class _Text:
         unused = _UNUSED_SETTINGS if scaled else _UNUSED_SETTINGS | {"settotalmass"}
         settings = {k: v for k, v in self.settings.items() if k not in unused}
         # Plugins may make meshes.
-        made = any(mesh.first("plugin") for mesh in self.meshes.values() if id(mesh) in self.needed)
-        sections = (*sections, "extension") if made else sections
+        has_plugin_mesh = any(mesh.first("plugin") for mesh in self.meshes.values() if id(mesh) in self.needed)
+        sections = (*sections, "extension") if has_plugin_mesh else sections
         inside = "".join(self._written(e, None) for e in self.mujoco.children if e.tag in sections)
         text = f"<mujoco>{element_text('compiler', settings)}{inside}</mujoco>"
         # Imported late: few files need the compiler.
@@ -161,13 +161,13 @@ class _Text:
             own |= {"contype": "0", "conaffinity": "0"}
         childclass = own.get("childclass", own.get("class", childclass) if tag == "frame" else childclass)
         own |= self.needed.get(id(element), {})
-        if id(element) in self.scene.called:
-            own["name"] = self.scene.called[id(element)]
+        if id(element) in self.scene.names_of_elements:
+            own["name"] = self.scene.names_of_elements[id(element)]
         shaped = tag == "extension" or id(element) in self.needed or id(element) in self.counted
-        kept = [e for e in element.children if e.tag not in _UNUSED and (shaped or e.tag != "plugin")]
+        children = [e for e in element.children if e.tag not in _UNUSED and (shaped or e.tag != "plugin")]
         if tag == "asset":
-            kept = [e for e in kept if e.tag != "mesh" or id(e) in self.needed]
-        return element_text(tag, own, "".join(self._written(e, childclass) for e in kept))
+            children = [e for e in children if e.tag != "mesh" or id(e) in self.needed]
+        return element_text(tag, own, "".join(self._written(e, childclass) for e in children))
 
 
 def _mass_properties(body: Any) -> MassProperties:

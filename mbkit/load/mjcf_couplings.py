@@ -278,20 +278,20 @@ class Transmissions:
 
     def _hold(self, out: Acting, element: Element, item: str, c: _Numbers, k: _Numbers, *rest: float) -> None:
         """Give a tendon or actuator its damper and spring, by functions where they are not linear, or keep a fault."""
-        line, held = bool(out.factors or out.ends), bool(out.factors or out.path)
+        linear, has_length = bool(out.factors or out.ends), bool(out.factors or out.path)
         k, c = (_NONE if flag in self._disabled else x for x, flag in ((k, "spring"), (c, "damper")))
-        if any(k[1:]) or k[0] < 0 or (k[0] and not (line and rest[0] == rest[1] and (out.factors or rest[0] >= 0))):
+        if any(k[1:]) or k[0] < 0 or (k[0] and not (linear and rest[0] == rest[1] and (out.factors or rest[0] >= 0))):
             out.band = _Band(k, *rest)
         else:
             out.stiffness, out.rest_length = k[0], rest[0]
-        if any(c[1:]) or c[0] < 0 or (c[0] and not line):
+        if any(c[1:]) or c[0] < 0 or (c[0] and not linear):
             out.damper = c
         else:
             out.damping = c[0]
-        lost = {"stiffness": out.band and not held, "damping": out.damper and not held}
-        for what in (n for n, x in (lost | {"armature": out.armature and not out.factors}).items() if x):
-            on = "a path over sites is an inertia that changes with q" if out.path else "what is no sum of coordinates"
-            self._read.fault(f"{item}: {what} of {on}; no description holds it, remove it", element)
+        unheld = {"stiffness": out.band and not has_length, "damping": out.damper and not has_length}
+        for what in (n for n, x in (unheld | {"armature": out.armature and not out.factors}).items() if x):
+            of = "a path over sites is an inertia that changes with q" if out.path else "what is no sum of coordinates"
+            self._read.fault(f"{item}: {what} of {of}; no description holds it, remove it", element)
 
     def _path(self, element: Element, item: str) -> tuple[tuple[float, _Points], ...]:
         """Return the branches of a path over sites; none where it wraps geoms."""
@@ -377,12 +377,13 @@ class Transmissions:
             along = _length(x, model, ca, ca.vertsplit(q))
             gradient, rows, rate = ca.gradient(along, q), {}, ca.SX(0)
             for joint in model.joints:
-                here, there = model.layout.q[joint.name], model.layout.v[joint.name]
-                part = ca.vertsplit(gradient[here]) if joint.type.nv else []
+                q_slice, v_slice = model.layout.q[joint.name], model.layout.v[joint.name]
+                part = ca.vertsplit(gradient[q_slice]) if joint.type.nv else []
                 if any(not entry.is_zero() for entry in part):
-                    own = ca.vertsplit(q[here])
-                    rows[joint.name] = joint.type.pullback(own, part)
-                    rate += ca.dot(gradient[here], ca.vertcat(*joint.type.qdot(own, ca.vertsplit(v[there]))))
+                    coordinates = ca.vertsplit(q[q_slice])
+                    rows[joint.name] = joint.type.pullback(coordinates, part)
+                    qdot = joint.type.qdot(coordinates, ca.vertsplit(v[v_slice]))
+                    rate += ca.dot(gradient[q_slice], ca.vertcat(*qdot))
             if x.band and rows:
                 b.add_joint_force(f"spring of tendon {x.name}", next(iter(rows)), potential=x.band.energy(along))
             c0, c1, c2 = x.damper or (0.0, 0.0, 0.0)
@@ -440,14 +441,14 @@ class Transmissions:
         elif servos:
             forces = "; ".join(x.servo for x in servos)
             yield f"{SERVOS} left out; with actuators=True they act at zero control: {forces}"
-        for what, at, some in (("tendons", "", self._tendons), ("actuators", ", at zero control", self._actuators)):
-            if bands := "; ".join(f"{x.item}: {x.functions()}" for x in some if x.functions()):
+        for what, at, group in (("tendons", "", self._tendons), ("actuators", ", at zero control", self._actuators)):
+            if bands := "; ".join(f"{x.item}: {x.functions()}" for x in group if x.functions()):
                 yield f"springs of {what}, and dampers, by functions: {bands}"
-            if acting := "; ".join(x.description() for x in some if x.acts):
+            if acting := "; ".join(x.description() for x in group if x.acts):
                 yield f"{what} that act as springs, dampers and rotors{at}: {acting}"
-            if lost := "; ".join(f"{x.item}: {', '.join(x.left_out)}" for x in some if x.left_out):
-                yield f"{LEFT_OUT} of {what}: {lost}"
-            if idle := ", ".join(x.item for x in some if not (x.acts or x.functions() or x.left_out or x.control)):
+            if left_out := "; ".join(f"{x.item}: {', '.join(x.left_out)}" for x in group if x.left_out):
+                yield f"{LEFT_OUT} of {what}: {left_out}"
+            if idle := ", ".join(x.item for x in group if not (x.acts or x.functions() or x.left_out or x.control)):
                 yield f"{what} that exert no force of their own: {idle}"
         if self._actuators:
             controls = "; ".join(x.control for x in self._actuators)

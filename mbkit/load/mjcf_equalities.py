@@ -68,7 +68,7 @@ class _End:
 
 
 class Equalities:
-    """The <equality> sections of a file; with `wanted` false, or switched off by a flag, none becomes a loop.
+    """The <equality> sections of a file; none becomes a loop unless `enabled`, or where a flag switches them off.
 
     `tendons` has dl/dq of each joint for the lengths that are sums of coordinates, and nothing for the others.
     """
@@ -79,7 +79,7 @@ class Equalities:
         scene: Scene,
         disabled: set[str],
         *,
-        wanted: bool,
+        enabled: bool,
         tendons: Mapping[str, Mapping[str, float]],
     ) -> None:
         self._scene, self._read = scene, scene.read
@@ -99,7 +99,7 @@ class Equalities:
             self._anchors[body.name] = body.anchor
         self._sites = {name: _End("world", X) for name, X in scene.sites}
         self._sites |= {name: _End(body.name, X) for body in scene.bodies for name, X in body.sites}
-        moved = {e.attributes.get("name") for e in mujoco.walk() if e.attributes.get("mocap") == "true"}
+        mocap_bodies = {e.attributes.get("name") for e in mujoco.walk() if e.attributes.get("mocap") == "true"}
         for element, label in elements:
             full = replace(scene.defaults.filled(replace(element, tag="equality"), None), tag=element.tag)
             why = "" if element.tag in (*_KINDS, *_COUPLED) else "no loop"
@@ -107,7 +107,7 @@ class Equalities:
                 why = f"option flag {sorted(off)[0]} is off"
             elif full.attributes.get("active") == "false":
                 why = "it is inactive"
-            elif not wanted and not why:
+            elif not enabled and not why:
                 why = "loops=False"
             if not why and element.tag in _COUPLED:
                 why = self._couple(full, f"equality {label}")
@@ -118,7 +118,7 @@ class Equalities:
                 a, b = (end.body for end in ends)
                 if self._carriers[a] == self._carriers[b]:
                     why = "no joint moves its ends against each other"
-                elif moved & {a, b}:
+                elif mocap_bodies & {a, b}:
                     why = "a motion capture body moves it"
                 else:
                     name = unused(element.attributes.get("name") or f"{element.tag}{len(self._loops) + 1}", self._loops)
@@ -149,11 +149,11 @@ class Equalities:
         shape = self._read.numbers(element, "polycoef", item, count=5, least=1, default=standard)
         shape = (*shape, *standard[len(shape) :])
         refs = {j.name: j.ref for body in self._scene.bodies for j in body.joints}
-        held = coupled(sides, shape, refs)
-        if isinstance(held, str):
-            return held
+        coupler = coupled(sides, shape, refs)
+        if isinstance(coupler, str):
+            return coupler
         name = unused(element.attributes.get("name") or f"{kind}{len(self._couplers) + 1}", self._couplers)
-        self._couplers[name] = held
+        self._couplers[name] = coupler
         return ""
 
     @staticmethod
@@ -162,10 +162,10 @@ class Equalities:
 
     def _softness(self, element: Element, item: str) -> str:
         """Return the numbers by which an element is softer or stiffer than MuJoCo's default, as text."""
-        said = {name: element.attributes[name] for name in _SOFT if name in element.attributes}
-        if "torquescale" in said and self._read.number(element, "torquescale", item, 1.0) == 1.0:
-            del said["torquescale"]
-        return ", ".join(f"{name} {' '.join(text.split())[:40]}" for name, text in said.items())
+        softness = {name: element.attributes[name] for name in _SOFT if name in element.attributes}
+        if "torquescale" in softness and self._read.number(element, "torquescale", item, 1.0) == 1.0:
+            del softness["torquescale"]
+        return ", ".join(f"{name} {' '.join(text.split())[:40]}" for name, text in softness.items())
 
     def _ends(self, element: Element, item: str) -> tuple[_End, _End] | None:
         """Return the two frames that an element binds; None after a fault."""
@@ -174,11 +174,11 @@ class Equalities:
             if any(x in names for x in ("body1", "body2", "anchor", "relpose")):
                 self._read.fault(f"{item}: sites, and bodies or an anchor; keep one of the two", element)
                 return None
-            found = [self._sites.get(names.get(key, "")) for key in ("site1", "site2")]
-            for key, site in zip(("site1", "site2"), found, strict=True):
+            ends = [self._sites.get(names.get(key, "")) for key in ("site1", "site2")]
+            for key, site in zip(("site1", "site2"), ends, strict=True):
                 if site is None:
                     self._read.fault(f"{item}: {key} {names.get(key, '')!r} is no site of the file", element)
-            a, b = found
+            a, b = ends
             return None if a is None or b is None else (a, b)
         body1, body2 = names.get("body1", ""), names.get("body2", "world")
         for key, body in (("body1", body1), ("body2", body2)):
@@ -193,13 +193,13 @@ class Equalities:
             return _End(body1, Pose(np.eye(3), point)), _End(body2, Pose(np.eye(3), at.p))
         point = np.array(self._read.numbers(element, "anchor", item, count=3, default=(0.0, 0.0, 0.0)))
         # A quaternion of zeros, MuJoCo's default, asks for the reference configuration.
-        given = np.array(
+        relpose = np.array(
             self._read.numbers(element, "relpose", item, count=7, default=(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0))
         )
-        if has_length(given[3:]):
-            R = spatial.matrix_from_quaternion(spatial.normalized(np.roll(given[3:], -1)))
+        if has_length(relpose[3:]):
+            R = spatial.matrix_from_quaternion(spatial.normalized(np.roll(relpose[3:], -1)))
             # MuJoCo takes its position for the first body's point, whatever the anchor on the second is.
-            return _End(body1, Pose(R, given[:3])), _End(body2, Pose(np.eye(3), point))
+            return _End(body1, Pose(R, relpose[:3])), _End(body2, Pose(np.eye(3), point))
         return _End(body1, between @ Pose(np.eye(3), point)), _End(body2, Pose(np.eye(3), point))
 
     def add_to(self, b: ModelBuilder, snap: Snapper) -> None:
@@ -214,8 +214,8 @@ class Equalities:
         for name, (joint, leaders, ratios, offset, curve) in self._couplers.items():
             b.add_coupler(name, joint, leaders, ratio=ratios, offset=offset, curve=curve)
         if self._couplers:
-            held = listing([repr(x) for x in self._couplers], 6)
-            b.note(f"equalities of joints, held exactly where MuJoCo's are soft: {held}")
+            names = listing([repr(x) for x in self._couplers], 6)
+            b.note(f"equalities of joints, held exactly where MuJoCo's are soft: {names}")
         if self._loops:
             b.note(f"loops, held exactly where MuJoCo's are soft: {listing([repr(x) for x in self._loops], 6)}")
         if self._soft:

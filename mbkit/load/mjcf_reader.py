@@ -116,7 +116,7 @@ class Scene:
     bodies: list[MjcfBody] = field(default_factory=list)
     names: dict[str, set[str]] = field(default_factory=lambda: {"body": {"world"}, "joint": set(), "site": set()})
     #: Names of bodies and joints, written or generated, by the element's id.
-    called: dict[int, str] = field(default_factory=dict)
+    names_of_elements: dict[int, str] = field(default_factory=dict)
     unnamed: Counter[str] = field(default_factory=Counter)
     #: Bodies whose inertia MuJoCo's compiler infers, and the geoms with their meshes that count for it.
     inferred: dict[str, list[tuple[Element, str]]] = field(default_factory=dict)
@@ -145,7 +145,7 @@ class Scene:
         if not name:
             self.unnamed[kind] += 1
             name = self.unused(kind, fallback)
-        self.called[id(element)] = name
+        self.names_of_elements[id(element)] = name
         return name
 
     def unused(self, kind: str, name: str) -> str:
@@ -177,7 +177,7 @@ def write_out_copies(mujoco: Element, compiler: Compiler, read: Reader) -> str:
         copier.size(world)
         # Inner copies are written out first: their numbers stand before the outer ones.
         _replace_all(world, "replicate", copier.copies)
-    return f"<replicate> written out: {listing(copier.told, 6)}" if copier.told else ""
+    return f"<replicate> written out: {listing(copier.notes, 6)}" if copier.notes else ""
 
 
 @dataclass
@@ -187,7 +187,7 @@ class _Copier:
     mujoco: Element
     compiler: Compiler
     read: Reader
-    told: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     left: int = MAX_ELEMENTS
 
     def size(self, element: Element) -> int:
@@ -229,7 +229,7 @@ class _Copier:
             at |= {n: own[n] for n in ("class", "childclass") if n in own}
             out[suffix] = replace(_suffixed(element, suffix), tag="frame", attributes=at)
             p = p + product(R, offset)
-        self.told += [f"{len(out)} copies ({element.place})", *_copy_naming(self.mujoco, element, out)]
+        self.notes += [f"{len(out)} copies ({element.place})", *_copy_naming(self.mujoco, element, out)]
         return out.values()
 
 
@@ -281,7 +281,7 @@ def write_out_attached(mujoco: Element, path: Path, compiler: Compiler, read: Re
         _set_main_apart(mujoco)
     for world in worlds:
         _replace_all(world, "attach", attacher.attached)
-    return f"<attach> written out: {listing(attacher.told, 6)}" if attacher.told else ""
+    return f"<attach> written out: {listing(attacher.notes, 6)}" if attacher.notes else ""
 
 
 def _set_main_apart(mujoco: Element) -> None:
@@ -324,7 +324,7 @@ class _Attacher:
     path: Path
     compiler: Compiler
     read: Reader
-    told: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     others: dict[str, _Other | None] = field(default_factory=dict)
     added: set[tuple[str, str]] = field(default_factory=set)
     left: int = MAX_ELEMENTS
@@ -337,18 +337,18 @@ class _Attacher:
             self.others[model] = self._other(model, element)
         if (other := self.others[model]) is None:
             return []
-        wanted = [(tag, own[tag]) for tag in ("body", "frame") if own.get(tag)]
+        targets = [(tag, own[tag]) for tag in ("body", "frame") if own.get(tag)]
         worlds = other.root.all("worldbody")
-        found = [x for world in worlds for x in self._found(world, wanted, None, other)] if wanted else []
-        if wanted and not found:
-            read.fault(f"<attach>: {wanted[0][0]} {wanted[0][1]!r} is not in {other.file}", element)
+        matches = [x for world in worlds for x in self._found(world, targets, None, other)] if targets else []
+        if targets and not matches:
+            read.fault(f"<attach>: {targets[0][0]} {targets[0][1]!r} is not in {other.file}", element)
             return []
-        parts = found[:1] or [(x, None) for world in worlds for x in world.children]
+        parts = matches[:1] or [(x, None) for world in worlds for x in world.children]
         self.left -= sum(1 for part, _ in parts for _ in part.walk())
         if self.left < 0:
             read.fault(f"<attach>: more than {MAX_ELEMENTS} elements; attach less", element)
             return []
-        self.told.append(f"{model!r} as {prefix!r} ({element.place})")
+        self.notes.append(f"{model!r} as {prefix!r} ({element.place})")
         if (model, prefix) not in self.added:
             self.added.add((model, prefix))
             self._add_shared(prefix, other, element)
@@ -393,13 +393,13 @@ class _Attacher:
         return _Other(root, path, compiler, Defaults(root, self.read), factor, file)
 
     def _found(
-        self, owner: Element, wanted: list[tuple[str, str]], childclass: str | None, other: _Other
+        self, owner: Element, targets: list[tuple[str, str]], childclass: str | None, other: _Other
     ) -> Iterator[tuple[Element, str | None]]:
         """Yield the element of this tag and name below another, with the class that reaches it."""
         for child in owner.children:
-            if (child.tag, child.attributes.get("name")) in wanted:
+            if (child.tag, child.attributes.get("name")) in targets:
                 yield child, childclass
-            yield from self._found(child, wanted, class_inside(child, childclass), other)
+            yield from self._found(child, targets, class_inside(child, childclass), other)
 
     def _add_shared(self, prefix: str, other: _Other, element: Element) -> None:
         """Add the defaults and meshes of a file, with a prefix."""
@@ -423,15 +423,15 @@ class _Attacher:
         names = _names(parts)
         for tag in _SECTIONS_WITH_REFERENCES:
             for section in other.root.all(tag):
-                kept = []
+                attached = []
                 for e in section.children:
                     inside = _inside(e, names)
                     if inside and all(inside):
                         own = {"class": "main"} | e.attributes
-                        kept.append(_Prefixed(prefix, other).of(replace(e, attributes=own), None))
+                        attached.append(_Prefixed(prefix, other).of(replace(e, attributes=own), None))
                         if tag == "tendon" and "name" in e.attributes:
                             names.setdefault(tag, set()).add(e.attributes["name"])
-                self.mujoco.children.append(Element(tag, {}, section.line, kept, file=other.file))
+                self.mujoco.children.append(Element(tag, {}, section.line, attached, file=other.file))
 
 
 @dataclass
@@ -505,18 +505,18 @@ def _copy_naming(mujoco: Element, element: Element, suffixes: Iterable[str]) -> 
     names = _names(element.children)
     for tag in _SECTIONS_WITH_REFERENCES:
         for section in mujoco.all(tag):
-            kept, copied = list[Element](), list[Element]()
+            originals, copied = list[Element](), list[Element]()
             for e in section.children:
                 inside = _inside(e, names)
                 if not any(inside):
-                    kept.append(e)
+                    originals.append(e)
                 elif tag == "equality" and not all(inside):
                     yield f"an equality with one end in them is left out, as by MuJoCo ({e.tag}, {e.place})"
                 else:
                     copied += [_suffixed(e, suffix, names) for suffix in suffixes]
                     if tag == "tendon" and "name" in e.attributes:
                         names.setdefault(tag, set()).add(e.attributes["name"])
-            section.children = [*kept, *copied]
+            section.children = [*originals, *copied]
 
 
 def frame_contents(
@@ -541,17 +541,17 @@ def add_free_base(mujoco: Element, read: Reader) -> None:
             elif child.tag in tags:
                 yield child
 
-    tops = [b for world in mujoco.all("worldbody") for b in parts(world, ("body",))]
-    joints = [len(list(parts(b, _JOINTS))) for b in tops]
-    if tops and (len(tops) > 1 or joints[0]):
-        names = (repr(b.attributes.get("name", "")) if b.attributes.get("name") else f"({b.place})" for b in tops)
-        there = ", ".join(f"{name} ({n} joint{'s' * (n != 1)})" for name, n in zip(names, joints, strict=True))
-        read.fault(f"floating_base=True needs one body of the world, without joints; there are: {there}")
+    bases = [b for world in mujoco.all("worldbody") for b in parts(world, ("body",))]
+    joints = [len(list(parts(b, _JOINTS))) for b in bases]
+    if bases and (len(bases) > 1 or joints[0]):
+        names = (repr(b.attributes.get("name", "")) if b.attributes.get("name") else f"({b.place})" for b in bases)
+        bodies = ", ".join(f"{name} ({n} joint{'s' * (n != 1)})" for name, n in zip(names, joints, strict=True))
+        read.fault(f"floating_base=True needs one body of the world, without joints; there are: {bodies}")
     elif any(e.tag in _JOINTS and e.attributes.get("name") == BASE_JOINT for e in mujoco.walk()):
         read.fault(f"joint {BASE_JOINT!r}: floating_base=True adds a joint of that name; rename yours")
-    elif tops:
-        joint = Element("freejoint", {"name": BASE_JOINT}, tops[0].line, file=tops[0].file)
-        tops[0].children.insert(0, joint)
+    elif bases:
+        joint = Element("freejoint", {"name": BASE_JOINT}, bases[0].line, file=bases[0].file)
+        bases[0].children.insert(0, joint)
 
 
 def read_tree(mujoco: Element, scene: Scene) -> None:
@@ -619,8 +619,8 @@ def _read_body(element: Element, parent: str, X: Pose, childclass: str | None, s
 def _aligned(joint: MjcfJoint, scene: Scene) -> bool:
     """Return whether the frame of a free body is to be its inertial frame; MuJoCo moves none with bodies below it."""
     choices = ("auto", "true", "false")
-    said = scene.read.choice(joint.element, "align", choices) if joint.element.tag == "freejoint" else "auto"
-    return said == "true" or (said == "auto" and scene.compiler.alignfree)
+    align = scene.read.choice(joint.element, "align", choices) if joint.element.tag == "freejoint" else "auto"
+    return align == "true" or (align == "auto" and scene.compiler.alignfree)
 
 
 def _inertial_frame(

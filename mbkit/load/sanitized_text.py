@@ -76,9 +76,9 @@ def strip(path: Path, *, floating_base: bool = False) -> Stripped:
     meshes = _Meshes(root, path) if format_ == "mjcf" else None
     writer = _Writer(format_, meshes)
     writer.write(root)
-    text, gone = "".join(writer.parts) + "\n", tuple(sorted(writer.gone.items()))
+    text, removed = "".join(writer.parts) + "\n", tuple(sorted(writer.gone.items()))
     files, unread = (meshes.files, tuple(dict.fromkeys(meshes.unread))) if meshes else ({}, ())
-    return Stripped(path, format_, root, text, gone, renamed, tuple(dict.fromkeys(writer.shapeless)), files, unread)
+    return Stripped(path, format_, root, text, removed, renamed, tuple(dict.fromkeys(writer.shapeless)), files, unread)
 
 
 def _with_base(robot: Element) -> tuple[Element, str]:
@@ -189,8 +189,8 @@ class _Writer:
 
     def write(self, element: Element) -> None:
         """Write an element and its kept children."""
-        kept = list(self._kept(element))
-        if self._shapeless(element, kept):
+        children = list(self._kept(element))
+        if self._shapeless(element, children):
             self.shapeless.append(element.attributes.get("name", "?"))
         below = (element.included_at or element.line) - self._line
         if below > 0:
@@ -198,20 +198,20 @@ class _Writer:
             self._line += below
         head = element_text(element.tag, self._attributes(element))
         inside = escape(" ".join(element.text.split()))
-        if not inside and not kept:
+        if not inside and not children:
             self.parts.append(head)
             return
         self.parts.append(f"{head.removesuffix('/>')}>{inside}")
-        for child in kept:
+        for child in children:
             self.write(child)
         self.parts.append(f"</{element.tag}>")
 
-    def _shapeless(self, element: Element, kept: list[Element]) -> bool:
+    def _shapeless(self, element: Element, children: list[Element]) -> bool:
         """Return whether a body has lost shapes from which MuJoCo would have inferred its inertia."""
         if self._meshes is not None:
             return element.tag == "body" and any(self._meshes.lost.get(id(e)) for e in element.all("geom"))
-        lost = any(e.tag in ("collision", "visual") and e not in kept for e in element.children)
-        return element.tag == "link" and element.first("inertial") is None and lost
+        lost_shape = any(e.tag in ("collision", "visual") and e not in children for e in element.children)
+        return element.tag == "link" and element.first("inertial") is None and lost_shape
 
     def _attributes(self, element: Element) -> dict[str, str]:
         own = element.attributes

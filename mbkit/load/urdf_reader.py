@@ -206,20 +206,20 @@ def _check_mimics(
 ) -> tuple[list[UrdfJoint], list[str]]:
     """Return the joints without the tags that cannot be followed, and notes on these."""
     by_name = {j.name: j for j in joints}
-    fixed, lost, suggestions = list[str](), list[str](), Suggestions()
+    on_fixed, unfollowed, suggestions = list[str](), list[str](), Suggestions()
     out = []
     for joint in joints:
         why = _why_lost(joint.mimic.joint, by_name, suggestions) if joint.mimic and joint.kind != "fixed" else ""
         if joint.mimic and joint.kind == "fixed":
-            fixed.append(joint.name)
+            on_fixed.append(joint.name)
         elif why:
-            lost.append(f"{joint.name} (mimics {why})")
+            unfollowed.append(f"{joint.name} (mimics {why})")
             if matters and not lenient:
                 read.fault(f"joint {joint.name!r}: mimics {why}; correct the name, or load with mimic='free'")
         out.append(replace(joint, mimic=None) if why or joint.kind == "fixed" else joint)
     notes = (
-        ("mimic tags on fixed joints say nothing and were left out", fixed),
-        ("mimic joints left independent, because their tags lead nowhere", lost),
+        ("mimic tags on fixed joints say nothing and were left out", on_fixed),
+        ("mimic joints left independent, because their tags lead nowhere", unfollowed),
     )
     return out, [f"{what}: {', '.join(names)}" for what, names in notes if names]
 
@@ -411,9 +411,9 @@ def _with_planes_turned(robot: Element, read: Reader) -> Element:
         placed = origin.attributes if origin is not None else {}
         turned = placed | {"rpy": _rpy(spatial.matrix_from_rpy(*rpy) @ R)}
         new = {"origin": turned, "child": {"link": plane}, "axis": {"xyz": "0 0 1"}}
-        kept = [c for c in e.children if c.tag not in new]
+        others = [c for c in e.children if c.tag not in new]
         children += [
-            replace(e, children=[*kept, *(Element(tag, x, e.line) for tag, x in new.items())]),
+            replace(e, children=[*others, *(Element(tag, x, e.line) for tag, x in new.items())]),
             Element("link", {"name": plane}, e.line),
             Element(
                 "joint",
@@ -479,8 +479,8 @@ def _attribute_hint(tag: str, name: str, known: frozenset[str]) -> str:
     """Return what to write for a misspelt attribute, or an unknown one among numbers of the dynamics."""
     if ":" in name or name in _HARMLESS:
         return ""
-    if meant := misspelt(name, known):
-        return f"did you mean {meant!r}?"
+    if correct := misspelt(name, known):
+        return f"did you mean {correct!r}?"
     return f"expected {', '.join(sorted(known)) or 'none'}" if tag in _WHOLE else ""
 
 
@@ -490,8 +490,8 @@ def _element_hint(owner: str, tag: str, known: frozenset[str]) -> str:
         return ""
     if places := [f"<{other}>" for other, (inside, _) in _SCHEMA.items() if tag in inside]:
         return f"it belongs into {' or '.join(places)}"
-    if meant := misspelt(tag, known):
-        return f"did you mean <{meant}>?"
+    if correct := misspelt(tag, known):
+        return f"did you mean <{correct}>?"
     return f"expected {', '.join(f'<{k}>' for k in sorted(known)) or 'none'}" if owner in _WHOLE else ""
 
 

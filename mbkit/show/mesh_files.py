@@ -204,8 +204,8 @@ class _Collada:
 
     def _geometry(self, geometry: Element) -> list[tuple[str, Surface]]:
         """Return the surfaces of a geometry, in its own axes, with the names of their materials."""
-        found = (e for mesh in geometry.all("mesh") for e in mesh.children)
-        parts = [(e, self._part(e)) for e in found if e.tag in ("triangles", "polylist", "polygons")]
+        parts_of_mesh = (e for mesh in geometry.all("mesh") for e in mesh.children)
+        parts = [(e, self._part(e)) for e in parts_of_mesh if e.tag in ("triangles", "polylist", "polygons")]
         return [(e.attributes.get("material", ""), s) for e, s in parts if s]
 
     def _part(self, part: Element) -> Surface | None:
@@ -214,19 +214,19 @@ class _Collada:
         return cleaned(positions, triangles) if len(triangles) else None
 
     def _positions(self, part: Element) -> tuple[int, Array]:
-        for given in part.all("input"):
-            vertices = self._target(given.attributes.get("source", ""))
-            if given.attributes.get("semantic") != "VERTEX" or vertices is None:
+        for used in part.all("input"):
+            vertices = self._target(used.attributes.get("source", ""))
+            if used.attributes.get("semantic") != "VERTEX" or vertices is None:
                 continue
             for own in vertices.all("input"):
                 source = self._target(own.attributes.get("source", ""))
                 if own.attributes.get("semantic") == "POSITION" and source and (array := source.first("float_array")):
-                    return int(given.attributes.get("offset", 0)), _numbers(array.text, float).reshape(-1, 3)
+                    return int(used.attributes.get("offset", 0)), _numbers(array.text, float).reshape(-1, 3)
         return 0, np.empty((0, 3))
 
     def _color(self, material: str) -> Color | None:
-        found = self._target(material)
-        instance = found.first("instance_effect") if found else None
+        element = self._target(material)
+        instance = element.first("instance_effect") if element else None
         effect = self._target(instance.attributes.get("url", "")) if instance else None
         return self.diffuse(effect) if effect else None
 

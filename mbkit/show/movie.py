@@ -112,7 +112,7 @@ class _Drawing:
         X = np.einsum("tij,tcj->tci", R[self.which], self.local) + p[self.which, None]
         flat = X - (X[..., 2:] - self.scene.ground) * (_KEY / _KEY[2])
         self.shadow.set_verts(self._seen(flat)[0])
-        seen, depth = self._seen(X)
+        projected, depth = self._seen(X)
         normals = np.cross(X[:, 1] - X[:, 0], X[:, 2] - X[:, 0])
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
         away = self.target + self.distance * self.axes[2] - X.mean(axis=1)
@@ -120,7 +120,7 @@ class _Drawing:
         light = 0.24 + 0.12 * normals[:, 2:] + 0.75 * np.maximum(normals @ _KEY, 0)[:, None]
         colors = np.concatenate([np.clip(self.colors[:, :3] * light, 0, 1) ** (1 / 2.2), self.colors[:, 3:]], axis=1)
         order = np.argsort(depth.mean(axis=1))
-        self.solids.set_verts(seen[order])
+        self.solids.set_verts(projected[order])
         self.solids.set_facecolor(colors[order])
         # The edge closes the gap between neighbours, and would show on what is transparent.
         self.solids.set_edgecolor(colors[order] * np.where(colors[order, 3:] < 1, [1, 1, 1, 0], 1))

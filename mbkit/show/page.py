@@ -26,7 +26,7 @@ def html(scene: Scene) -> str:
     data = json.dumps(content(scene), separators=(",", ":")).replace("<", "\\u003c")
     title = _escape.html(_escape.one_line(scene.name))
     parts = {"digest": f"sha256-{digest}", "title": title, "scene": data, "script": script}
-    return re.sub("@(digest|title|scene|script)@", lambda found: parts[found[1]], _text("page.html"))
+    return re.sub("@(digest|title|scene|script)@", lambda match: parts[match[1]], _text("page.html"))
 
 
 @cache

@@ -75,26 +75,26 @@ def shapes_of(model: Model, kind: Kind = "visual") -> list[Shape]:
         raise InputError(f"shapes: expected one of {', '.join(SHAPES)}, got {shown(kind)}")
     PICTURE.admit(model)
     model.require_values("show")
-    found = Visuals()
+    visuals = Visuals()
     try:
         for which in () if kind == "sticks" or not model.sources else (kind, *(s for s in SHAPES[:2] if s != kind)):
-            found = read_visuals(model, which)
+            visuals = read_visuals(model, which)
             # A few contact shapes are no picture of a robot.
-            few = which != kind and 2 * len({s.body for s in found.shapes}) < len(model.bodies)
-            if (found.shapes and not few) or found.missing:
+            few = which != kind and 2 * len({s.body for s in visuals.shapes}) < len(model.bodies)
+            if (visuals.shapes and not few) or visuals.missing:
                 break
-            found = Visuals()
+            visuals = Visuals()
     except LoadError as error:
         warn(f"{model.name}: its shapes are not read, and it is drawn as capsules and boxes: {error}", MbkitWarning)
-    bodies = {model.frame(name).body for name in found.missing if name != "world"}
-    if found.shapes and model.drawn_from:
+    bodies = {model.frame(name).body for name in visuals.missing if name != "world"}
+    if visuals.shapes and model.drawn_from:
         # Bodies that were added to the robot have no file.
-        bodies |= {body.name for body in model.bodies if body.mass} - {s.body for s in found.shapes}
-    if found.missing:
-        several = listing([f"{name} ({why})" for name, why in found.missing.items()], 3)
+        bodies |= {body.name for body in model.bodies if body.mass} - {s.body for s in visuals.shapes}
+    if visuals.missing:
+        several = listing([f"{name} ({why})" for name, why in visuals.missing.items()], 3)
         warn(f"{model.name}: meshes that cannot be read are drawn as capsules and boxes: {several}", MbkitWarning)
-    if found.shapes or bodies:
-        return found.shapes + stand_ins(model, bodies - {s.body for s in found.shapes})
+    if visuals.shapes or bodies:
+        return visuals.shapes + stand_ins(model, bodies - {s.body for s in visuals.shapes})
     return stand_ins(model, {body.name for body in model.bodies})
 
 

@@ -117,13 +117,13 @@ def cleaned(vertices: Any, triangles: Any, color: Color | None = None) -> Surfac
     V, T = np.asarray(vertices, dtype=np.float64).reshape(-1, 3), np.asarray(triangles, dtype=np.int64).reshape(-1, 3)
     if not len(T) or T.min() < 0 or T.max() >= len(V):
         raise ValueError("no triangles, or some with vertices that are not there")
-    kept = T[(T[:, 0] != T[:, 1]) & (T[:, 1] != T[:, 2]) & (T[:, 2] != T[:, 0])]
-    if len(kept):
-        _, first = np.unique(np.sort(kept, axis=1), axis=0, return_index=True)
-        kept = kept[np.sort(first)]
-    if not len(kept):
+    triangles_left = T[(T[:, 0] != T[:, 1]) & (T[:, 1] != T[:, 2]) & (T[:, 2] != T[:, 0])]
+    if len(triangles_left):
+        _, first = np.unique(np.sort(triangles_left, axis=1), axis=0, return_index=True)
+        triangles_left = triangles_left[np.sort(first)]
+    if not len(triangles_left):
         raise ValueError("all triangles are points or lines")
-    used, own = np.unique(kept, return_inverse=True)
+    used, own = np.unique(triangles_left, return_inverse=True)
     if not np.isfinite(V[used]).all():
         raise ValueError("vertices that are not finite numbers")
     return Surface(V[used], own.reshape(-1, 3), color)

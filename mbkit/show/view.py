@@ -159,10 +159,10 @@ def animate(
     frames = int(min((t[-1] - t[0]) * rate, most)) + 1
     if filmed and frames > most:
         raise InputError(f"fps: expected a film of at most {most} frames, got {rate:g} a second for {t[-1] - t[0]:g} s")
-    wanted = t[0] + np.arange(frames) / rate if filmed else np.linspace(t[0], t[-1], max(frames, 2))
+    times = t[0] + np.arange(frames) / rate if filmed else np.linspace(t[0], t[-1], max(frames, 2))
     # Saved states only: the nearest in time.
-    after = np.clip(np.searchsorted(t, wanted), 1, max(len(t) - 1, 1)) if len(t) > 1 else np.zeros(1, int)
-    which = np.where(wanted - t[after - 1] <= t[after] - wanted, after - 1, after) if len(t) > 1 else after
+    after = np.clip(np.searchsorted(t, times), 1, max(len(t) - 1, 1)) if len(t) > 1 else np.zeros(1, int)
+    which = np.where(times - t[after - 1] <= t[after] - times, after - 1, after) if len(t) > 1 else after
     if not filmed:
         which = np.unique(which)
     return view_of(model, q[which], t[which], path, shapes, triangles, fps=rate)

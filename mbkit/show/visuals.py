@@ -216,7 +216,7 @@ def _mjcf(model: _Bodies, source: Path, mujoco: Element, kind: str) -> Visuals:
     out, assets = Visuals(), dict[str, bytes]()
     settings = Compiler.of(mujoco, Reader())
     write_out_attached(mujoco, source, settings, Reader())
-    lost: dict[str, str] = {}
+    missing: dict[str, str] = {}
     for name, mesh in mesh_assets(mujoco).items():
         file = mesh.attributes.get("file", "")
         path = source.parent / settings.mesh_path(file)
@@ -224,15 +224,15 @@ def _mjcf(model: _Bodies, source: Path, mujoco: Element, kind: str) -> Visuals:
             continue
         content, why = read_mesh(path)
         if why:
-            lost[name] = why
+            missing[name] = why
             continue
         # MuJoCo caches meshes by name, so a name stands for its content.
         own = hashlib.sha256(content).hexdigest() + path.suffix
         assets[own] = content
         mesh.attributes |= {"name": name, "file": own}
-    text = "".join(_written(e, lost, out) for e in mujoco.children if e.tag in ("default", "asset", "worldbody"))
-    kept = {"angle", "eulerseq", "autolimits", "inertiafromgeom", "fitaabb", "boundmass", "boundinertia"}
-    merged = {k: x for e in mujoco.all("compiler") for k, x in e.attributes.items() if k in kept}
+    text = "".join(_written(e, missing, out) for e in mujoco.children if e.tag in ("default", "asset", "worldbody"))
+    names = {"angle", "eulerseq", "autolimits", "inertiafromgeom", "fitaabb", "boundmass", "boundinertia"}
+    merged = {k: x for e in mujoco.all("compiler") for k, x in e.attributes.items() if k in names}
     # A body without mass for want of its mesh compiles, too.
     merged |= {"boundmass": "1e-9", "boundinertia": "1e-9", "balanceinertia": "true"}
     compiled = _compiled(f"<mujoco>{element_text('compiler', merged)}{text}</mujoco>", assets, source)
@@ -240,19 +240,19 @@ def _mjcf(model: _Bodies, source: Path, mujoco: Element, kind: str) -> Visuals:
     return out
 
 
-def _written(element: Element, lost: dict[str, str], out: Visuals, body: str = "world") -> str:
+def _written(element: Element, missing: dict[str, str], out: Visuals, body: str = "world") -> str:
     """Return an element without lost meshes, textures, and what says nothing about shapes."""
     if element.tag in ("texture", "hfield", "skin", "model", "plugin", "camera", "light", "flexcomp"):
         return ""
     if element.tag == "body":
         body = element.attributes.get("name", "")
     name = mesh_name(element) if element.tag == "mesh" else element.attributes.get("mesh", "")
-    if element.tag in ("mesh", "geom") and (name in lost or element.attributes.get("type") == "hfield"):
-        if element.tag == "geom" and name in lost:
-            out.missing.setdefault(body, lost[name])
+    if element.tag in ("mesh", "geom") and (name in missing or element.attributes.get("type") == "hfield"):
+        if element.tag == "geom" and name in missing:
+            out.missing.setdefault(body, missing[name])
         return ""
     attributes = {k: x for k, x in element.attributes.items() if k != "texture"}
-    return element_text(element.tag, attributes, "".join(_written(e, lost, out, body) for e in element.children))
+    return element_text(element.tag, attributes, "".join(_written(e, missing, out, body) for e in element.children))
 
 
 def _compiled(text: str, assets: dict[str, bytes], source: Path) -> Any:

@@ -163,10 +163,10 @@ class DeviceArray:
     def seen(self, view: Callable[[Array], Array]) -> DeviceArray:
         """Return what a function that only looks at an array makes of it, without a copy."""
         # Never read: there is one number behind it.
-        held = np.empty(1)
-        near = np.lib.stride_tricks.as_strided(held, self.shape, [8 * s for s in self._strides], writeable=False)
-        out = view(near)
-        offset = (out.ctypes.data - held.ctypes.data) // 8 if out.size else 0
+        element = np.empty(1)
+        strided = np.lib.stride_tricks.as_strided(element, self.shape, [8 * s for s in self._strides], writeable=False)
+        out = view(strided)
+        offset = (out.ctypes.data - element.ctypes.data) // 8 if out.size else 0
         strides = tuple(s // 8 for s in out.strides)
         return DeviceArray(self._device, self._address + 8 * offset, out.shape, strides, self._owner)
 
@@ -214,38 +214,38 @@ class _Memory:
         finalize(self, device.release, self.address)
 
 
-def like(x: DeviceArray, given: Any) -> Any:
+def like(x: DeviceArray, arguments: Any) -> Any:
     """Return an array of the library that `given` is of, where it takes DLPack; else `x`."""
-    if isinstance(given, DeviceArray):
+    if isinstance(arguments, DeviceArray):
         return x
-    library = sys.modules.get({"jaxlib": "jax.numpy"}.get(root := type(given).__module__.partition(".")[0], root))
+    library = sys.modules.get({"jaxlib": "jax.numpy"}.get(root := type(arguments).__module__.partition(".")[0], root))
     take = getattr(library, "from_dlpack", None)
     return x if take is None else take(x)
 
 
-def batch_on_device(code: OnDevice, trim: Callable[[Array], Array], given: dict[str, Any]) -> Any:
+def batch_on_device(code: OnDevice, trim: Callable[[Array], Array], arguments: dict[str, Any]) -> Any:
     """Return a quantity of arrays on the GPU, (N, size) or (size,), in the first one's library; None where it is bad.
 
     Other arguments may be arrays of the host. Results have their samples side by side where all arguments have.
     """
-    seen = {k: viewed(k, x, code.device) if is_on_device(x) else None for k, x in given.items()}
-    near = {k: np.asarray(given[k], dtype=np.float64) for k, x in seen.items() if x is None}
-    shapes = [(near[k] if x is None else x).shape for k, x in seen.items()]
+    on_device = {k: viewed(k, x, code.device) if is_on_device(x) else None for k, x in arguments.items()}
+    on_host = {k: np.asarray(arguments[k], dtype=np.float64) for k, x in on_device.items() if x is None}
+    shapes = [(on_host[k] if x is None else x).shape for k, x in on_device.items()]
     single = all(len(shape) == 1 for shape in shapes)
     n = 1 if single else next((shape[0] for shape in shapes if len(shape) == 2), 0)
-    for (name, shape), size in zip(zip(given, shapes, strict=True), code.inputs, strict=True):
+    for (name, shape), size in zip(zip(arguments, shapes, strict=True), code.inputs, strict=True):
         if shape not in ((size,), (n, size)):
             raise InputError(f"{name}: expected shape {(size,)} or {(n, size)}, got {shape}")
     places: list[Any] = []
-    for name, x in seen.items():
+    for name, x in on_device.items():
         if x is None:
-            places.append(np.broadcast_to(near[name], (n, near[name].shape[-1])))
+            places.append(np.broadcast_to(on_host[name], (n, on_host[name].shape[-1])))
         else:
             places.append(Place(x.address, x.strides[-1], x.strides[0] if len(x.shape) == 2 else 0))
-    major = n > 1 and all(x is None or x.shape[-1] == 1 or x.strides[0] == 1 for x in seen.values())
+    major = n > 1 and all(x is None or x.shape[-1] == 1 or x.strides[0] == 1 for x in on_device.values())
     outs = [DeviceArray.empty(code.device, (n, r * c), major=major) for r, c in code.shapes]
     if n and not code.on_device(places, [out.as_batch() for out in outs], n):
         return None
     rows, columns = code.shapes[0]
     result = outs[0].seen(lambda x: trim(x.reshape(n, rows, columns))[0 if single else slice(None)])
-    return like(result, next(x for x in given.values() if is_on_device(x)))
+    return like(result, next(x for x in arguments.values() if is_on_device(x)))

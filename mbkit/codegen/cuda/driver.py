@@ -76,9 +76,9 @@ class Device:
         self.code_name = (f"sm_{major}{minor}", self.target, str(_ask("cuDriverGetVersion")))
         with self.current(), suppress(DeviceError):
             # Freed memory stays with the process: asking for it again takes longer than most kernels.
-            pool, kept = _ask("cuDeviceGetDefaultMemPool", self._handle), driver().CUmemPool_attribute
+            pool, attributes = _ask("cuDeviceGetDefaultMemPool", self._handle), driver().CUmemPool_attribute
             threshold = driver().cuuint64_t(2**63)
-            _ask("cuMemPoolSetAttribute", pool, kept.CU_MEMPOOL_ATTR_RELEASE_THRESHOLD, threshold)
+            _ask("cuMemPoolSetAttribute", pool, attributes.CU_MEMPOOL_ATTR_RELEASE_THRESHOLD, threshold)
 
     @contextmanager
     def current(self) -> Iterator[None]:

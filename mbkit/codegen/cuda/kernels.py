@@ -47,28 +47,28 @@ def ptx(text: str, target: str) -> bytes:
         return str(machine.emit_assembly(module)).encode() + b"\0"
 
 
-def kernel_code(made: Program, quaternions: Sequence[int] = ()) -> tuple[str, int]:
+def kernel_code(code: Program, quaternions: Sequence[int] = ()) -> tuple[str, int]:
     """Return LLVM code of a program's kernel, and how many doubles of work space each thread needs.
 
     `quaternions` are the places in the first argument where unit quaternions begin.
     """
-    _require_known(made)
-    pieces = pieces_of(made)
-    slots = slots_of(made, pieces)
-    check = _Entry(made, [], "c")
+    _require_known(code)
+    pieces = pieces_of(code)
+    slots = slots_of(code, pieces)
+    check = _Entry(code, [], "c")
     check.require_unit(quaternions)
-    written = [_Entry(made, piece) for piece in pieces]
+    written = [_Entry(code, piece) for piece in pieces]
     for k, piece in enumerate(written):
         piece.write(slots, first=k == 0)
-    given = _Entry.parameters(made)
+    parameters = _Entry.parameters(code)
     functions, lines = [], check.lines if quaternions else []
     if len(written) == 1:
         lines = [*lines, *written[0].lines]
     else:
         functions = [p.function(f"{BATCH}_{k}") for k, p in enumerate(written)]
-        plain = given.replace("noalias ", "")
+        plain = parameters.replace("noalias ", "")
         lines = [*lines, *(f"  call void @{BATCH}_{k}({plain}, i64 %s)" for k in range(len(written)))]
-    text = "\n".join([declarations(1), library(1, made), *functions, _entry(BATCH, given, "\n".join(lines))])
+    text = "\n".join([declarations(1), library(1, code), *functions, _entry(BATCH, parameters, "\n".join(lines))])
     return _HEAD + text, max(slots.values(), default=0) + 1
 
 
@@ -108,17 +108,17 @@ done:
 class _Entry(Piece):
     """A piece of a batch's kernel, with its arrays among the parameters."""
 
-    def __init__(self, made: Program, piece: list[int], prefix: str = "v") -> None:
-        super().__init__(made, piece, 1)
-        self._made, self._text = made, Text(1, prefix)
+    def __init__(self, code: Program, piece: list[int], prefix: str = "v") -> None:
+        super().__init__(code, piece, 1)
+        self._made, self._text = code, Text(1, prefix)
         self.store_zeros()
 
     lines: list[str] = forwarded("_text.lines", "The piece's instructions.")
 
     @staticmethod
-    def parameters(made: Program) -> str:
+    def parameters(code: Program) -> str:
         """Return the kernel's parameters."""
-        arrays = [f"{way}{i}" for way, many in (("in", made.inputs), ("out", made.shapes)) for i in range(len(many))]
+        arrays = [f"{side}{i}" for side, many in (("in", code.inputs), ("out", code.shapes)) for i in range(len(many))]
         each = [
             (kind, f"{a}{end}") for a in arrays for kind, end in (("ptr", ""), ("i64", "_across"), ("i64", "_along"))
         ]
@@ -169,21 +169,21 @@ class _Entry(Piece):
 class _Values(Piece):
     """A program among others of one function: its arguments are values there, and so are its results."""
 
-    def __init__(self, made: Program, text: Text, given: Sequence[Sequence[str] | str]) -> None:
-        super().__init__(made, [k for k, o in enumerate(made.operations) if o.name not in ("input", "const")], 1)
+    def __init__(self, code: Program, text: Text, arguments: Sequence[Sequence[str] | str]) -> None:
+        super().__init__(code, [k for k, o in enumerate(code.operations) if o.name not in ("input", "const")], 1)
         self.store_zeros()
-        self._text, self._given, self._made = text, given, dict[tuple[int, int], str]()
+        self._text, self._given, self._made = text, arguments, dict[tuple[int, int], str]()
         self.write({}, first=True)
-        self.results = [[self._made[i, j] for j in range(out.size)] for i, out in enumerate(made.outputs)]
+        self.results = [[self._made[i, j] for j in range(out.size)] for i, out in enumerate(code.outputs)]
 
     def _place(self, arrays: str, strides: str, i: int, j: int) -> Any:  # noqa: ARG002  # values have no address
         return i, j
 
     def _load(self, pointer: Any) -> str:
         i, j = pointer
-        given = self._given[i]
+        argument = self._given[i]
         # Numbers that all threads share are read where they are used: registers have no room for them.
-        return _read(self._text, given, str(j)) if isinstance(given, str) else given[j]
+        return _read(self._text, argument, str(j)) if isinstance(argument, str) else argument[j]
 
     def _store(self, value: str, pointer: Any) -> None:
         self._made[pointer] = value
@@ -204,16 +204,16 @@ def steps_code(parts: Sequence[Part], state: Sequence[str], force: str = "tau") 
     read from an array of its own, with strides between steps, entries and samples; the numbers of a state feedback are
     the same for every thread.
     """
-    made = {part.name: program(part.make()).fused for part in {part.name: part for part in parts}.values()}
-    _require_known(*made.values())
+    programs = {part.name: program(part.make()).fused for part in {part.name: part for part in parts}.values()}
+    _require_known(*programs.values())
     sizes = dict.fromkeys(state, 1)
     for part in parts:
-        sizes |= dict(zip(part.reads, made[part.name].inputs, strict=True))
-        sizes |= dict(zip(part.writes, (r * c for r, c in made[part.name].shapes), strict=True))
+        sizes |= dict(zip(part.reads, programs[part.name].inputs, strict=True))
+        sizes |= dict(zip(part.writes, (r * c for r, c in programs[part.name].shapes), strict=True))
     written = {name for part in parts for name in part.writes}
-    held = [*state, *(name for name in sizes if name not in written and name not in (*state, force, LAW))]
-    starts = accumulate((sizes[name] for name in held), initial=0)
-    rows = {name: (start, sizes[name]) for name, start in zip(held, starts, strict=False)}
+    stored = [*state, *(name for name in sizes if name not in written and name not in (*state, force, LAW))]
+    starts = accumulate((sizes[name] for name in stored), initial=0)
+    rows = {name: (start, sizes[name]) for name, start in zip(stored, starts, strict=False)}
 
     first, t, last = (Text(1, prefix) for prefix in "bvl")
     values: dict[str, Any] = {LAW: LAW}
@@ -224,13 +224,10 @@ def steps_code(parts: Sequence[Part], state: Sequence[str], force: str = "tau") 
     places = [t.put(f"add i64 {now}, {t.put(f'mul i64 %force_across, {j}')}") for j in range(sizes.get(force, 0))]
     values[force] = [_read(t, "force", place) for place in places]
     times = Counter(part.name for part in parts)
-    functions = [_part_function(name, made[name]) for name, n in times.items() if n > 1]
+    functions = [_part_function(name, programs[name]) for name, n in times.items() if n > 1]
     for part in parts:
-        given = [values[name] for name in part.reads]
-        several = times[part.name] > 1
-        results = (
-            _called(t, part.name, made[part.name], given) if several else _Values(made[part.name], t, given).results
-        )
+        code, arguments, several = programs[part.name], [values[name] for name in part.reads], times[part.name] > 1
+        results = _called(t, part.name, code, arguments) if several else _Values(code, t, arguments).results
         values |= dict(zip(part.writes, results, strict=True))
     phis = [
         f"  {old} = phi {_V} [ {start}, %begin ], [ {new}, %one ]"
@@ -245,7 +242,7 @@ def steps_code(parts: Sequence[Part], state: Sequence[str], force: str = "tau") 
     body = "\n".join([*first.lines, *loop, *phis, *t.lines, *more, "over:", *last.lines])
     parameters = f"ptr %arena, ptr noalias %{LAW}, i64 %n, i64 %steps, ptr %force"
     parameters += ", i64 %force_step, i64 %force_across, i64 %force_along"
-    texts = [_HEAD, declarations(1), library(1, *made.values()), *functions, _entry(STEPS, parameters, body)]
+    texts = [_HEAD, declarations(1), library(1, *programs.values()), *functions, _entry(STEPS, parameters, body)]
     return "\n".join(texts), {"rows": rows, "size": sum(n for _, n in rows.values())}
 
 
@@ -261,25 +258,25 @@ def _read(t: Text, array: str, place: str) -> str:
     return t.put(f"load {_V}, ptr {_address(t, array, place)}, align 8")
 
 
-def _results(made: Program) -> str:
-    return "{ " + ", ".join([_V] * sum(out.size for out in made.outputs)) + " }"
+def _results(code: Program) -> str:
+    return "{ " + ", ".join([_V] * sum(out.size for out in code.outputs)) + " }"
 
 
-def _part_function(name: str, made: Program) -> str:
+def _part_function(name: str, code: Program) -> str:
     """Return the function of a part, of values."""
     t = Text(1, "f")
-    given = [[f"%x{i}_{j}" for j in range(n)] for i, n in enumerate(made.inputs)]
+    arguments = [[f"%x{i}_{j}" for j in range(n)] for i, n in enumerate(code.inputs)]
     out = "poison"
-    for i, x in enumerate(x for each in _Values(made, t, given).results for x in each):
-        out = t.put(f"insertvalue {_results(made)} {out}, {_V} {x}, {i}")
-    parameters = ", ".join(f"{_V} {x}" for each in given for x in each)
+    for i, x in enumerate(x for each in _Values(code, t, arguments).results for x in each):
+        out = t.put(f"insertvalue {_results(code)} {out}, {_V} {x}, {i}")
+    parameters = ", ".join(f"{_V} {x}" for each in arguments for x in each)
     lines = "\n".join(t.lines)
-    head = f"define internal {_results(made)} @mbkit_part_{name}({parameters}) noinline nounwind"
-    return f"{head} {{\n{lines}\n  ret {_results(made)} {out}\n}}\n"
+    head = f"define internal {_results(code)} @mbkit_part_{name}({parameters}) noinline nounwind"
+    return f"{head} {{\n{lines}\n  ret {_results(code)} {out}\n}}\n"
 
 
-def _called(t: Text, name: str, made: Program, given: Sequence[Sequence[str]]) -> list[list[str]]:
-    arguments = ", ".join(f"{_V} {x}" for each in given for x in each)
-    out = t.put(f"call {_results(made)} @mbkit_part_{name}({arguments})")
-    each = (t.put(f"extractvalue {_results(made)} {out}, {i}") for i in count())
-    return [[next(each) for _ in range(x.size)] for x in made.outputs]
+def _called(t: Text, name: str, code: Program, arguments: Sequence[Sequence[str]]) -> list[list[str]]:
+    values = ", ".join(f"{_V} {x}" for each in arguments for x in each)
+    out = t.put(f"call {_results(code)} @mbkit_part_{name}({values})")
+    each = (t.put(f"extractvalue {_results(code)} {out}, {i}") for i in count())
+    return [[next(each) for _ in range(x.size)] for x in code.outputs]

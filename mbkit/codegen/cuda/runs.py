@@ -72,39 +72,39 @@ class OnDevice(Compiled):
         return all(good)
 
     def _near(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> bool:
-        with self._room() as taken:
-            places = [self._sent(x, taken) for x in inputs]
+        with self._room() as allocate:
+            places = [self._sent(x, allocate) for x in inputs]
             makes = [_as_sent(x, copy=False) for x in outputs]
-            made = [Place(taken(x.size), across, along) for x, across, along in makes]
-            good = self._kernel.launch(places, made, len(inputs[0]), taken)
-            for x, (near, _, _), place in zip(outputs, makes, made, strict=True):
-                self.device.download(place.address, near)
-                if not np.may_share_memory(near, x):
-                    x[:] = near.T if near.shape != x.shape else near
+            results = [Place(allocate(x.size), across, along) for x, across, along in makes]
+            good = self._kernel.launch(places, results, len(inputs[0]), allocate)
+            for x, (host, _, _), place in zip(outputs, makes, results, strict=True):
+                self.device.download(place.address, host)
+                if not np.may_share_memory(host, x):
+                    x[:] = host.T if host.shape != x.shape else host
         return good
 
     def on_device(self, inputs: Sequence[Place | Array], outputs: Sequence[Place], n: int) -> bool:
         """Fill outputs on the GPU from inputs on it, or on the host; return what `run` does."""
-        with self._room() as taken:
-            places = [x if isinstance(x, Place) else self._sent(x, taken) for x in inputs]
-            return self._kernel.launch(places, outputs, n, taken)
+        with self._room() as allocate:
+            places = [x if isinstance(x, Place) else self._sent(x, allocate) for x in inputs]
+            return self._kernel.launch(places, outputs, n, allocate)
 
     @contextmanager
     def _room(self) -> Iterator[Callable[[int], int]]:
         """Give a function that takes room for so many doubles, which is freed at the end."""
         with self.device.current(), ExitStack() as stack:
 
-            def taken(size: int) -> int:
+            def allocate(size: int) -> int:
                 address = self.device.take(8 * size)
                 stack.callback(self.device.give, address)
                 return address
 
-            yield taken
+            yield allocate
 
-    def _sent(self, x: Array, taken: Callable[[int], int]) -> Place:
-        near, across, along = _as_sent(x)
-        place = Place(taken(near.size), across, along)
-        self.device.upload(near, place.address)
+    def _sent(self, x: Array, allocate: Callable[[int], int]) -> Place:
+        host, across, along = _as_sent(x)
+        place = Place(allocate(host.size), across, along)
+        self.device.upload(host, place.address)
         return place
 
 
@@ -127,14 +127,14 @@ class _Kernel:
         self.shapes = tuple((r, c) for r, c in about["shapes"])
         self._function = device.load(code, BATCH, self)
 
-    def launch(self, inputs: Sequence[Place], outputs: Sequence[Place], n: int, taken: Callable[[int], int]) -> bool:
+    def launch(self, inputs: Sequence[Place], outputs: Sequence[Place], n: int, allocate: Callable[[int], int]) -> bool:
         """Run it, and wait; return whether all numbers are finite and quaternions are of unit length."""
-        flags, found = taken(1), np.zeros(2, dtype=np.int32)
-        self.device.upload(found, flags)
-        work = taken(self._work * n) if self._work > 1 else flags
+        flags, marks = allocate(1), np.zeros(2, dtype=np.int32)
+        self.device.upload(marks, flags)
+        work = allocate(self._work * n) if self._work > 1 else flags
         self.device.launch(self._function, n, *(x for place in (*inputs, *outputs) for x in place), n, flags, work)
-        self.device.download(flags, found)
-        return not found.any()
+        self.device.download(flags, marks)
+        return not marks.any()
 
 
 _HELD: Final[WeakValueDictionary[str, _Kernel]] = WeakValueDictionary()
@@ -150,15 +150,15 @@ def on_device(
     """
 
     def kernel() -> tuple[dict[str, Any], bytes]:
-        made = program(make()).fused
-        text, work = kernel_code(made, quaternions or ())
-        about = {"inputs": made.inputs, "shapes": made.shapes, "operations": made.arithmetic, "work": work}
+        code = program(make()).fused
+        text, work = kernel_code(code, quaternions or ())
+        about = {"inputs": code.inputs, "shapes": code.shapes, "operations": code.arithmetic, "work": work}
         return about, device.machine_code(text)
 
     def held() -> _Kernel:
         with jit.COMPILING:
             key = _key("batch", [*name, *map(str, quaternions or ())], device)
-            return disk.cached(key, _HELD, lambda *found: _Kernel(device, *found), kernel)
+            return disk.cached(key, _HELD, lambda *entry: _Kernel(device, *entry), kernel)
 
     return OnDevice(device, held, lambda: compiled(name, make), "" if quaternions is None else CUDA)
 
@@ -207,8 +207,8 @@ class Arena:
         if name in self._steps.rows:
             with self._device.current():
                 shape = self._steps.rows[name][1], self._count
-                near = np.ascontiguousarray(np.broadcast_to(x, shape))
-                self._device.upload(near, self._place(name))
+                host = np.ascontiguousarray(np.broadcast_to(x, shape))
+                self._device.upload(host, self._place(name))
 
     def share(self, numbers: Array) -> None:
         """Copy in the numbers of a state feedback."""
@@ -228,9 +228,9 @@ class Arena:
         with self._device.current():
             address = self._device.take(force.nbytes)
             try:
-                near = np.ascontiguousarray(force)
-                self._device.upload(near, address)
-                many, rows, wide = near.shape
+                host = np.ascontiguousarray(force)
+                self._device.upload(host, address)
+                many, rows, wide = host.shape
                 strides = rows * wide if many > 1 else 0, wide, int(wide > 1)
                 arguments = self._address, self._shared or self._address, self._count, count, address, *strides
                 self._device.launch(self._steps._function, self._count, *arguments)
@@ -255,4 +255,4 @@ def steps_on_device(
         return about, device.machine_code(text)
 
     with jit.COMPILING:
-        return disk.cached(_key("steps", name, device), _STEPS, lambda *made: CudaSteps(device, *made), code)
+        return disk.cached(_key("steps", name, device), _STEPS, lambda *entry: CudaSteps(device, *entry), code)

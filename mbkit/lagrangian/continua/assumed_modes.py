@@ -84,8 +84,8 @@ def assumed_modes(system: Densities, shapes: Any, name: str) -> AssumedModes:
     if not isinstance(name, str) or not name.strip():
         raise InputError(f"name: expected a text, got {name!r}")
     q = tuple(sp.Symbol(f"{name}{i + 1}") for i in range(len(read)))
-    taken = {s.name for x in (*system._parts.values(), *system.ends) for s in x.free_symbols}
-    clash = [s for s in q if s.name in taken]
+    used_names = {s.name for x in (*system._parts.values(), *system.ends) for s in x.free_symbols}
+    clash = [s for s in q if s.name in used_names]
     if clash:
         raise InputError(f"name: {plain(clash)} is in the energies or forces already; give the modes another name")
     work = Reduction(system, read, q)

@@ -168,13 +168,13 @@ def beam(
         if space:
             raise UnsupportedError("tip_inertia: a body that turns at the end is written in a plane only")
         T_end += inertia * (turn[1, 0] + slopes[0].diff(t)) ** 2 / 2
-    held = [x for f in bent for x in ((f, f.diff(s)) if V.has(f.diff(s, 2)) else (f,))]
+    clamped = [x for f in bent for x in ((f, f.diff(s)) if V.has(f.diff(s, 2)) else (f,))]
     return Continuum(
         T,
         V,
         tuple(bent),
         (0, L),
-        fixed={0: held},
+        fixed={0: clamped},
         T_ends={L: T_end},
         V_ends={L: V_end},
         coordinates=q,

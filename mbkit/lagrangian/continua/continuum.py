@@ -136,8 +136,8 @@ class Continuum(Densities):
                     still = {s: 0 for s in jets.among(balance) if self._held(s, end)}
                     at_ends.append((end, sp.Eq(_short(-balance.subs(still), jets), 0, evaluate=False)))
         # An end that passes nothing on, as the free end of a turning string, takes every motion that stays finite.
-        kept = [pair for pair in at_ends if pair[1].lhs != 0]
-        return FieldEquations(tuple(inside), tuple(sorted(kept, key=lambda x: self.ends.index(x[0]))), jets)
+        nontrivial = [pair for pair in at_ends if pair[1].lhs != 0]
+        return FieldEquations(tuple(inside), tuple(sorted(nontrivial, key=lambda x: self.ends.index(x[0]))), jets)
 
     def _held(self, s: sp.Symbol, end: sp.Expr) -> bool:
         field, (along, _) = self.jets.order(s)
@@ -145,8 +145,8 @@ class Continuum(Densities):
 
     def _forces(self, L: Any, field: int, along: int) -> sp.Expr:
         """Return Σ (-d/dt)^i ∂L/∂w of the derivatives of a field along x of one order."""
-        found = [s for s in self.jets.among(sp.sympify(L)) if self.jets.order(s)[0] == field]
-        terms = [(self.jets.order(s)[1], s) for s in found]
+        derivatives = [s for s in self.jets.among(sp.sympify(L)) if self.jets.order(s)[0] == field]
+        terms = [(self.jets.order(s)[1], s) for s in derivatives]
         return sp.Add(*((-1) ** o[1] * self.jets.rate(sp.diff(L, s), o[1]) for o, s in terms if o[0] == along))
 
     def discretized(self, shapes: Sequence[Any], name: str = "a") -> AssumedModes:

@@ -36,8 +36,8 @@ class Densities:
             raise InputError(f"ends: expected two places, such as (0, L), got {ends!r}")
         self.ends = tuple(expression("ends", e) for e in ends)
         if (self.ends[1] - self.ends[0]).is_nonpositive or any(e.has(jets.x, jets.t) for e in self.ends):
-            wanted = "a lower and an upper place, two places that differ"
-            raise InputError(f"ends: expected {wanted} and do not hold {jets.x} or {jets.t}, got {ends}")
+            expected = "a lower and an upper place, two places that differ"
+            raise InputError(f"ends: expected {expected} and do not hold {jets.x} or {jets.t}, got {ends}")
         self.T_ends = {e: jets(f"T_ends[{e}]", x) for e, x in self._at_ends("T_ends", T_ends)}
         self.V_ends = {e: jets(f"V_ends[{e}]", x) for e, x in self._at_ends("V_ends", V_ends)}
         self.forces = {}
@@ -89,8 +89,8 @@ class Densities:
     @cached_property
     def orders(self) -> tuple[int, ...]:
         """The highest derivative of each field along x in T and V."""
-        found = [self.jets.order(s) for s in self.jets.among(self.T - self.V)]
-        return tuple(max((o[0] for f, o in found if f == k), default=0) for k in range(len(self.jets.fields)))
+        orders = [self.jets.order(s) for s in self.jets.among(self.T - self.V)]
+        return tuple(max((o[0] for f, o in orders if f == k), default=0) for k in range(len(self.jets.fields)))
 
 
 def _mapping(what: str, source: Any) -> Mapping[Any, Any]:

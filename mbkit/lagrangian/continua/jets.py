@@ -105,11 +105,11 @@ class Jets:
 
     def groups(self, shown: Iterable[sp.Expr]) -> list[list[sp.Symbol]]:
         """Return moving symbols by their derivatives by the time, as printers order them."""
-        found = {s for x in shown for s in self.among(x)}
+        symbols = {s for x in shown for s in self.among(x)}
         own: Mapping[int, tuple[sp.Symbol, ...]] = {0: self.coordinates, 1: self.velocities, 2: self.accelerations}
-        most = max([2, *(self._known[s][1][1] for s in found)])
+        most = max([2, *(self._known[s][1][1] for s in symbols)])
         return [
-            [*own.get(k, ()), *sorted((s for s in found if self._known[s][1][1] == k), key=lambda s: self._known[s])]
+            [*own.get(k, ()), *sorted((s for s in symbols if self._known[s][1][1] == k), key=lambda s: self._known[s])]
             for k in range(most + 1)
         ]
 

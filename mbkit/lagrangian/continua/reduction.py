@@ -80,5 +80,5 @@ def terms(system: Densities, what: str, x: sp.Expr) -> list[tuple[tuple[sp.Symbo
             f"{what}: {x} is no polynomial of the fields and their derivatives, and modes cannot be put in; expand it "
             "to the powers that matter"
         )
-    found = sp.Poly(x, *moving).terms()
-    return [(tuple(s for s, k in zip(moving, powers, strict=True) for _ in range(k)), c) for powers, c in found]
+    monomials = sp.Poly(x, *moving).terms()
+    return [(tuple(s for s, k in zip(moving, powers, strict=True) for _ in range(k)), c) for powers, c in monomials]

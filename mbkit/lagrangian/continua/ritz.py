@@ -64,13 +64,13 @@ def normal_modes(system: Densities, count: int, values: Mapping[Any, float]) -> 
         raise InputError(f"values: expected a mapping of parameters to numbers, got {values!r}")
     moved = _moved(system)
     ends = (*system.ends, *system.T_ends.values(), *system.V_ends.values())
-    held = sp.Add(system.T, system.V, *ends, *moved.values())
-    own = held.free_symbols - {system.jets.x, *system.jets.among(held)}
-    given = {name_of(s): sp.Rational(real(f"values[{s}]", x)) for s, x in values.items()}
-    missing = [s for s in own if s.name not in given]
+    everything = sp.Add(system.T, system.V, *ends, *moved.values())
+    own = everything.free_symbols - {system.jets.x, *system.jets.among(everything)}
+    numbers = {name_of(s): sp.Rational(real(f"values[{s}]", x)) for s, x in values.items()}
+    missing = [s for s in own if s.name not in numbers]
     if missing:
         raise InputError(f"values: no value for {plain(missing)}; a mode of free vibration takes one of each parameter")
-    ritz = _Ritz(system, {s: given[s.name] for s in own})
+    ritz = _Ritz(system, {s: numbers[s.name] for s in own})
     before: Any = None
     for step in range(_MAX_REFINEMENTS):
         squares, vectors, shift = ritz.eigenpairs(2 * count + _EXTRA_MONOMIALS + _ADDED_MONOMIALS * step, count)
@@ -149,8 +149,8 @@ class _Ritz:
         ends = tuple(e.subs(self._numbers) for e in self._system.ends)
 
         def measure(c: sp.Expr) -> OfPower:
-            found = weights_of(c, self._system.jets.x, ends, what)
-            weights = [(f, self._length * _digits(k)) for f, k in found.items()]
+            exact = weights_of(c, self._system.jets.x, ends, what)
+            weights = [(f, self._length * _digits(k)) for f, k in exact.items()]
             return cache(lambda n: mpmath.fsum(k * self._integrals.of_power(f, n) for f, k in weights))
 
         return measure

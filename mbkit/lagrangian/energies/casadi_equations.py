@@ -61,8 +61,8 @@ class EnergyEquations(ConstraintQuantities, Equations):
             self._turns = [ca.mtimes(ca.reshape(turn, n, n), self.v) for turn in turns]
         self.kin = SimpleNamespace(qdot=qdot, pullback=pullback)  # type: ignore[assignment]
         kinds = ("constraints", form.constraints), ("velocity_constraints", form.velocity_constraints)
-        rows = tuple(f"{what}[{k}] ({_short(x)})" for what, found in kinds for k, x in enumerate(found))
-        f, speeds = (read.matrix(found) for _, found in kinds)
+        rows = tuple(f"{what}[{k}] ({_short(x)})" for what, rows_of_kind in kinds for k, x in enumerate(rows_of_kind))
+        f, speeds = (read.matrix(rows_of_kind) for _, rows_of_kind in kinds)
         self.constraints = ConstraintTerms(f, self.q, self.v, self.time, rows, qdot, speeds)
         self.parameters = values.parameters
         self.constants, self.constant_values = values.constants, values.constant_values

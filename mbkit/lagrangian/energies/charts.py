@@ -30,8 +30,8 @@ def chart_names(model: Model) -> list[str]:
     for joint in model.independent_joints:
         own, k = [next(names) for _ in range(joint.type.nq)], joint.type.quaternion
         if k is not None:
-            taken = {*out, *model.coordinate_names, *model.parameters}
-            own = [free_name(x, taken) for x in _indexed(model, joint, (*joint.type.suffixes[:k], *_ANGLES))]
+            used_names = {*out, *model.coordinate_names, *model.parameters}
+            own = [free_name(x, used_names) for x in _indexed(model, joint, (*joint.type.suffixes[:k], *_ANGLES))]
         out += own
     return out
 

@@ -196,13 +196,13 @@ class EnergyForm:
         for name, x in _parts(self).items():
             kind, at_zero = (sp.Abs, 0) if name == "dissipation" else (sp.sign, 1)
             for a in sorted(x.atoms(kind), key=str) if name.startswith(("forces", "dissipation")) else ():
-                held = sorted(a.free_symbols & {*self.velocities}, key=str)
-                slopes = [(w, sp.diff(a.args[0], w)) for w in held]
+                own_velocities = sorted(a.free_symbols & {*self.velocities}, key=str)
+                slopes = [(w, sp.diff(a.args[0], w)) for w in own_velocities]
                 solved = [(w, w - a.args[0] / slope) for w, slope in slopes if slope != 0 and not slope.has(w)]
                 size = sp.Dummy()
                 # Its factor at the velocity where it jumps: v² sign(v) does not jump.
                 factor = sp.diff(x.xreplace({a: size}), size).subs(size, at_zero).subs(solved[:1])
-                if held and not is_zero(factor):
+                if own_velocities and not is_zero(factor):
                     out.append(f"{name} by {a}")
         return tuple(out)
 
@@ -223,21 +223,21 @@ class EnergyForm:
         own = {s.name: s for s in self.parameters}
         functions = sorted({f for x in _parts(self).values() for f in x.atoms(AppliedUndef)}, key=str)
         numbers, known = {}, {s.name: s for s in symbols_of(self)}
-        made: dict[Any, sp.Lambda] = {}
+        definitions: dict[Any, sp.Lambda] = {}
         for key, x in values.items():
             name, value = name_of(key), by_name(expression(f"values[{key}]", x, known), known)
             forms = [f for f in functions if f.func.__name__ == name]
             if name in own and not isinstance(key, (AppliedUndef, UndefinedFunction)):
                 numbers[own[name]] = value
             elif forms:
-                made[forms[0].func] = _as_function(key, forms, value, known)
+                definitions[forms[0].func] = _as_function(key, forms, value, known)
             else:
                 parameters = plain(self.parameters) or "none"
                 raise InputError(f"values: {key} is no parameter or function; the parameters are {parameters}")
 
         def replaced(x: Any) -> Any:
             # The derivatives of a function that is now known are known too.
-            x = x.subs([*made.items()]).subs(numbers).doit()
+            x = x.subs([*definitions.items()]).subs(numbers).doit()
             return by_name(x, {s.name: s for s in (*self.coordinates, *self.parameters)})
 
         out = self._arguments()
@@ -261,15 +261,15 @@ def _as_function(key: Any, forms: list[Any], value: sp.Expr, known: Mapping[str,
         raise InputError(f"values: {key} stands as {', '.join(map(str, forms))}; give one of them with its value")
     arguments = key.args if isinstance(key, AppliedUndef) else forms[0].args
     own = {x: sp.Symbol(name_of(x)) for x in arguments if isinstance(x, AppliedUndef)}
-    given = [by_name(own.get(x, x), known) for x in arguments]
-    if not all(isinstance(x, sp.Symbol) for x in given) or len({*given}) < len(given) or isinstance(value, sp.Lambda):
+    names = [by_name(own.get(x, x), known) for x in arguments]
+    if not all(isinstance(x, sp.Symbol) for x in names) or len({*names}) < len(names) or isinstance(value, sp.Lambda):
         raise InputError(
             f"values: expected {forms[0].func.__name__} of a symbol with an expression in it, such as "
             f"{forms[0].func.__name__}(x): x**2, got {key}: {value}"
         )
-    if any(len(f.args) != len(given) for f in forms):
-        raise InputError(f"values: {key} has {len(given)} arguments, but {', '.join(map(str, forms))} stands here")
-    return sp.Lambda(tuple(given), value.subs(own))
+    if any(len(f.args) != len(names) for f in forms):
+        raise InputError(f"values: {key} has {len(names)} arguments, but {', '.join(map(str, forms))} stands here")
+    return sp.Lambda(tuple(names), value.subs(own))
 
 
 def vanish(parts: Iterable[sp.Expr]) -> bool:
@@ -358,15 +358,15 @@ def _forces(into: PlainSymbols, source: Any) -> dict[sp.Symbol, sp.Expr]:
     if not isinstance(source, Mapping):
         raise InputError(f"forces: expected {{coordinate: force}}, got {source!r}")
     out: dict[sp.Symbol, sp.Expr] = dict.fromkeys(into.coordinates, sp.Integer(0))
-    seen = set()
+    named = set()
     for key, value in source.items():
         coordinate = into("forces", key)
         if coordinate not in out:
             names = ", ".join(map(str, into.coordinates))
             raise InputError(f"forces: {key} is no coordinate; the coordinates are {names}")
-        if coordinate in seen:
+        if coordinate in named:
             raise InputError(f"forces: {coordinate} stands twice; add the forces along it")
-        seen.add(coordinate)
+        named.add(coordinate)
         out[coordinate] = into(f"forces[{key}]", value)
     return out
 
@@ -449,13 +449,13 @@ def _warn_of_mass_in_time(d: EnergyForm) -> None:
     # Quasi-velocities may move while masses do not.
     if t is None or d.quasi is not None or any(k.b) or k.T0 != 0:
         return
-    held = [w.name for i, w in enumerate(d.velocities) if t in k.M[i, i].free_symbols and d.forces[i] == 0]
-    if not held:
+    affected = [w.name for i, w in enumerate(d.velocities) if t in k.M[i, i].free_symbols and d.forces[i] == 0]
+    if not affected:
         return
     warn(
-        f"T: the mass matrix of {', '.join(held)} depends on the time {t}, which adds dM/dt v to the equation. That is "
-        "right where something drives a length. Where mass leaves or joins with the relative velocity u, the force "
-        "dm/dt (v + u) is missing; add it to forces (Meshchersky's equation)",
+        f"T: the mass matrix of {', '.join(affected)} depends on the time {t}, which adds dM/dt v to the equation. "
+        "That is right where something drives a length. Where mass leaves or joins with the relative velocity u, the "
+        "force dm/dt (v + u) is missing; add it to forces (Meshchersky's equation)",
         MbkitWarning,
     )
 
@@ -467,9 +467,9 @@ def _check_velocities(d: EnergyForm) -> None:
     if unknown:
         raise InputError(f"T: {unknown[0]} is a function of a velocity; T is of second degree in the velocities")
     for name, x in _parts(d).items():
-        held = x.free_symbols & moving
-        if held and name.startswith("constraints"):
-            raise InputError(f"{name}: expected coordinates, time and parameters only, got the velocity {plain(held)}")
+        rates = x.free_symbols & moving
+        if rates and name.startswith("constraints"):
+            raise InputError(f"{name}: expected coordinates, time and parameters only, got the velocity {plain(rates)}")
     if d.dissipation != 0 and not d.dissipation.free_symbols & moving:
         raise InputError(
             f"dissipation: {d.dissipation} holds none of the velocities {', '.join(map(str, d.velocities))}, and its "

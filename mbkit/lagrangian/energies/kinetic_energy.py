@@ -83,9 +83,9 @@ def _quadratic(x: sp.Expr, velocities: Sequence[sp.Symbol]) -> bool:
     probe = RandomEvaluation([x], velocities)
     with mpmath.workdps(PROBE_DIGITS):
         for seed in range(PROBE_PLACES):
-            start, way = probe.place(2 * seed), probe.place(2 * seed + 1)
+            start, direction = probe.place(2 * seed), probe.place(2 * seed + 1)
             # Through velocities of both signs, where what has a kink shows it.
-            places = ({c: y / 3 + s * way[c] if c in velocities else y for c, y in start.items()} for s in _STEPS)
+            places = ({c: y / 3 + s * direction[c] if c in velocities else y for c, y in start.items()} for s in _STEPS)
             values = [point[0] for point in map(probe, places) if point is not None]
             if len(values) < len(_STEPS):
                 continue
@@ -156,21 +156,21 @@ def warn_of_negative(
 
     Where a parameter in it has no value, nothing is known.
     """
-    held = {s: values[s] for s in M.free_symbols if s in values}
-    if None in held.values():
+    numbers = {s: values[s] for s in M.free_symbols if s in values}
+    if None in numbers.values():
         return
-    probe, n, way = RandomEvaluation([*M]), len(velocities), None
+    probe, n, direction = RandomEvaluation([*M]), len(velocities), None
     for seed in range(2 * PROBE_PLACES):
         # Small deflections too: what holds for these alone, as of beams, may be negative far away.
-        near = {s: x * _NEAR_ZERO_FACTOR ** (seed % 2) for s, x in probe.place(seed).items()}
-        found = probe({**near, **{s: mpmath.mpf(x) for s, x in held.items()}})
-        if found is None or any(mpmath.im(x) for x in found):
+        place = {s: x * _NEAR_ZERO_FACTOR ** (seed % 2) for s, x in probe.place(seed).items()}
+        entries = probe({**place, **{s: mpmath.mpf(x) for s, x in numbers.items()}})
+        if entries is None or any(mpmath.im(x) for x in entries):
             return
-        sizes, ways = np.linalg.eigh(np.array(found, dtype=float).reshape(n, n))
+        sizes, directions = np.linalg.eigh(np.array(entries, dtype=float).reshape(n, n))
         if sizes[0] >= -_ZERO_EIGENVALUE_RATIO * abs(sizes[-1]):
             return
-        way = ways[:, 0]
-    names = [w.name for w, x in zip(velocities, way, strict=True) if abs(x) > 1e-6]  # type: ignore[arg-type]
+        direction = directions[:, 0]
+    names = [w.name for w, x in zip(velocities, direction, strict=True) if abs(x) > 1e-6]  # type: ignore[arg-type]
     warn(f"T: a motion of {', '.join(names)} has negative kinetic energy; no mass or inertia does that", MbkitWarning)
 
 

@@ -131,10 +131,10 @@ class PlainSymbols:
 def undefined(x: sp.Expr, known: Iterable[sp.Symbol]) -> list[sp.Expr]:
     """Return derivatives and undefined functions in an expression but those of known symbols, such as J(theta)."""
     # J′(2 θ) is a derivative by a symbol of its own, taken at 2 θ.
-    symbols = {*known, *(v for held in x.atoms(sp.Subs) for v in held.variables)}
-    found = [*x.atoms(sp.Derivative), *x.atoms(AppliedUndef)]
-    of_symbols = [d for d in found if isinstance(d, sp.Derivative) and not d.expr.has(AppliedUndef)]
-    return [f for f in found if f in of_symbols or not (f.free_symbols and f.free_symbols <= symbols)]
+    symbols = {*known, *(v for substitution in x.atoms(sp.Subs) for v in substitution.variables)}
+    functions = [*x.atoms(sp.Derivative), *x.atoms(AppliedUndef)]
+    of_symbols = [d for d in functions if isinstance(d, sp.Derivative) and not d.expr.has(AppliedUndef)]
+    return [f for f in functions if f in of_symbols or not (f.free_symbols and f.free_symbols <= symbols)]
 
 
 def plain(names: Iterable[sp.Symbol]) -> str:

@@ -136,11 +136,11 @@ def _content(model: Model) -> tuple[list[Any], list[Any]]:
     numbers: list[Any] = [model.gravity]
     for where in ("bodies", "joints", "springs", "couplings", "loops"):
         for part in getattr(model, where):
-            held, rules = {f.name: getattr(part, f.name) for f in fields(part)}, rules_of(type(part))
+            values, rules = {f.name: getattr(part, f.name) for f in fields(part)}, rules_of(type(part))
             # Data and what jumps are those of the model.
             own = (f for f, rule in rules.items() if rule.direction or (not rule.fixed and rule.absent is None))
-            numbers += [held[f] for f in own if "jump" not in rules[f].does]
-            names += [(where, f, x) for f, x in held.items() if f not in rules]
+            numbers += [values[f] for f in own if "jump" not in rules[f].does]
+            names += [(where, f, x) for f, x in values.items() if f not in rules]
     return names, numbers
 
 

@@ -170,8 +170,8 @@ def program(model: Model, quantity: str = "inverse_dynamics") -> ProgramText:
     uses.update(int(j) for out in operations.outputs for j in out.ravel())
     known, terms = list[sp.Expr](), list[tuple[sp.Symbol, sp.Expr]]()
 
-    def called(x: sp.Expr, wanted: str) -> sp.Symbol:
-        symbol = sp.Symbol(free_name(wanted, used))
+    def called(x: sp.Expr, name: str) -> sp.Symbol:
+        symbol = sp.Symbol(free_name(name, used))
         used.add(symbol.name)
         terms.append((symbol, x))
         return symbol
@@ -199,10 +199,10 @@ def _inputs(function: Any, model: Model) -> tuple[_Inputs, set[str]]:
     used |= {f"{name}_" for name in function.name_in()}
     for i, name in enumerate(function.name_in()):
         numbered = [f"{name}{k + 1}" for k in range(function.size1_in(i))]
-        taken = list(model.parameters) if name == "parameters" else numbered
+        names = list(model.parameters) if name == "parameters" else numbered
         entries = []
-        for wanted in taken:
-            entries.append(sp.Symbol(identifier(wanted, used)))
+        for entry in names:
+            entries.append(sp.Symbol(identifier(entry, used)))
             used.add(entries[-1].name)
         out.append((name, tuple(entries)))
     return tuple(out), used

@@ -106,7 +106,7 @@ def impulse_equations(
     rows = listed("rows", rows) if isinstance(rows, (sp.Basic, str)) or not hasattr(rows, "__len__") else list(rows)
     if not impulses and not rows:
         raise InputError("impulses: expected impulses on coordinates or rows that are imposed, got neither")
-    n, given = len(system.coordinates), _given(system, impulses or {})
+    n, applied = len(system.coordinates), _given(system, impulses or {})
     G = [_row(system, f"rows[{k}]", row) for k, row in enumerate(rows)]
     e = read_expression(system, "restitution", restitution, others=True)
     if e.is_number and not 0 <= e <= 1:
@@ -118,7 +118,7 @@ def impulse_equations(
     J = sp.Matrix(own).col_join(sp.Matrix(len(G), n, [x for row, _ in G for x in row]))
     rebound = [-e * (sp.Matrix([row]) * v)[0] - (1 + e) * rest for row, rest in G]
     # Symbols of the arguments keep their names.
-    shown = sp.Tuple(e, *given, *(x for row, rest in G for x in (*row, rest)))
+    shown = sp.Tuple(e, *applied, *(x for row, rest in G for x in (*row, rest)))
     used = {s.name for s in (*symbols_of(system), *shown.free_symbols)}
     after = tuple(sp.Symbol(free_name(f"{w.name}_after", used)) for w in system.velocities)
     names = tuple(sp.Symbol(free_name(f"P{k + 1}", used)) for k in range(J.rows))
@@ -128,7 +128,7 @@ def impulse_equations(
         velocities_after=after,
         impulse_symbols=names,
         mass_matrix=system.kinetic.M,
-        impulses=sp.ImmutableMatrix(given),
+        impulses=sp.ImmutableMatrix(applied),
         jacobian=sp.ImmutableMatrix(J),
         right=sp.ImmutableMatrix([*(-x for x in system.constraint_drift), *rebound])
         if J.rows

@@ -203,8 +203,8 @@ class _Frame:
         if isinstance(choice, Mapping):
             w, defined = _defined(system, choice)
         else:
-            kept = _simplest(system, A) if choice is None else _chosen(system, choice)
-            w = tuple(system.velocities[i] for i in kept)
+            independent = _simplest(system, A) if choice is None else _chosen(system, choice)
+            w = tuple(system.velocities[i] for i in independent)
             defined = sp.Matrix(w)
         if len(w) != r:
             raise InputError(f"quasi_velocities: expected {r}, one for each degree of freedom, got {len(w)}")
@@ -262,19 +262,19 @@ def _simplest(system: EnergyForm, A: sp.ImmutableMatrix) -> list[int]:
 
 def _places(A: sp.ImmutableMatrix) -> tuple[int, ...]:
     """Return columns that are independent of each other, as many as there are, from the last on."""
-    found: list[int] = []
+    places: list[int] = []
     for i in reversed(range(A.cols)):
-        if len(found) < A.rows and _rank([sp.Matrix(A[:, [i, *found]])]) > len(found):
-            found.insert(0, i)
-    return tuple(found)
+        if len(places) < A.rows and _rank([sp.Matrix(A[:, [i, *places]])]) > len(places):
+            places.insert(0, i)
+    return tuple(places)
 
 
 def _dependent(system: EnergyForm, A: sp.ImmutableMatrix) -> tuple[int, ...]:
     """Return velocities that the rows give by the others; refuse rows that depend on each other."""
-    found = _places(A)
-    if len(found) < A.rows:
+    places = _places(A)
+    if len(places) < A.rows:
         raise InputError(f"{system.name}: its constraints follow from each other or contradict each other")
-    return found
+    return places
 
 
 def _along(x: Any, system: EnergyForm, qdot: sp.Matrix) -> Any:
@@ -480,10 +480,10 @@ def _independent(known: Sequence[sp.Matrix], more: Iterable[sp.Matrix]) -> list[
     out: list[sp.Matrix] = []
     rank = _rank([*known])
     for x in more:
-        found = _rank([*known, *out, x])
-        if found > rank:
+        larger_rank = _rank([*known, *out, x])
+        if larger_rank > rank:
             out.append(x)
-            rank = found
+            rank = larger_rank
     return out
 
 

@@ -117,9 +117,9 @@ class Routhian(Printable, Generic[FormT]):
         s, n = self.system, len(self.system.coordinates)
         q, v = rows("q", q, n, s.name, "nq"), rows("v", v, n, s.name, "nv")
         p = self._momenta(q, v, numbers_at(s, t, values, "reduce"))[..., 0]
-        kept, _ = self._places
+        remaining, _ = self._places
         momenta = {x.name: p[..., k] if p.ndim > 1 else float(p[k]) for k, x in enumerate(self.momenta)}
-        return ReducedState(q[..., kept].copy(), v[..., kept].copy(), momenta)
+        return ReducedState(q[..., remaining].copy(), v[..., remaining].copy(), momenta)
 
     def reconstruct(self, run: Any, q0: ArrayLike, **values: float) -> Motion:
         """Return the motion t, q, v of the whole system, (K,), (K, n), (K, n); the ignored coordinates by quadrature.
@@ -137,11 +137,11 @@ class Routhian(Printable, Generic[FormT]):
             Of the reduced system's parameters and momenta, by name; a Trajectory brings its own.
         """
         t, q, v, numbers = _read(self, run, values)
-        kept, ignored = self._places
+        remaining, ignored = self._places
         start = _start(self, q0, q)
         steps = _increments(self, t, q, v, numbers)
         whole, speeds = (np.empty((len(t), len(self.system.coordinates))) for _ in range(2))
-        whole[:, kept], speeds[:, kept] = q, v
+        whole[:, remaining], speeds[:, remaining] = q, v
         whole[:, ignored] = start + np.concatenate([np.zeros((1, len(ignored))), np.cumsum(steps, axis=0)])
         speeds[:, ignored] = self._rates(t, q, v, numbers)
         return Motion(t, whole, speeds)
@@ -174,8 +174,8 @@ class Routhian(Printable, Generic[FormT]):
 def routhian(system: FormT, cyclic: Any = None) -> Routhian[FormT]:
     """Return the reduction of a system by the `cyclic` coordinates, or by all that are cyclic and unforced."""
     ignored = _chosen(system, cyclic)
-    kept = [q for q in system.coordinates if q not in ignored]
-    r, c = ([system.coordinates.index(q) for q in part] for part in (kept, ignored))
+    remaining = [q for q in system.coordinates if q not in ignored]
+    r, c = ([system.coordinates.index(q) for q in part] for part in (remaining, ignored))
     k = system.kinetic
     symbols = momentum_symbols(system, ignored)
     excess = [symbol - k.b[i] for symbol, i in zip(symbols, c, strict=True)]
@@ -191,10 +191,10 @@ def routhian(system: FormT, cyclic: Any = None) -> Routhian[FormT]:
     reduced = type(system)(
         T=sp.Add(*squared) / 2 + sum(x * w for x, w in zip(b, v, strict=True)) + k.T0,
         V=system.V + squares.form(excess, excess) / 2,
-        coordinates=kept,
+        coordinates=remaining,
         velocities=v,
         time=system.time,
-        forces=_forces(system, kept, ignored, eliminated),
+        forces=_forces(system, remaining, ignored, eliminated),
         dissipation=tidy(system.dissipation),
         parameters={**system.parameters, **dict.fromkeys(symbols)},
         constraints=system.constraints,
@@ -234,11 +234,11 @@ def _chosen(system: EnergyForm, cyclic: Any) -> list[sp.Symbol]:
 
 
 def _forces(
-    system: EnergyForm, kept: list[sp.Symbol], ignored: list[sp.Symbol], eliminated: Mapping[sp.Symbol, sp.Expr]
+    system: EnergyForm, remaining: list[sp.Symbol], ignored: list[sp.Symbol], eliminated: Mapping[sp.Symbol, sp.Expr]
 ) -> dict[sp.Symbol, sp.Expr]:
     """Return the forces along the remaining coordinates, without the ignored velocities."""
     forces = {q: system.inputs.get(q, x) for q, x in zip(system.coordinates, system.forces, strict=True)}
-    out = {q: tidy(forces[q].subs(eliminated)) for q in kept if forces[q] != 0}
+    out = {q: tidy(forces[q].subs(eliminated)) for q in remaining if forces[q] != 0}
     for q, x in out.items():
         _need_not(ignored, x, f"the force {forces[q]} along {q}")
     for row in system.velocity_constraints:
@@ -249,9 +249,9 @@ def _forces(
 
 
 def _need_not(ignored: list[sp.Symbol], x: sp.Expr, what: str) -> None:
-    held = x.free_symbols & set(ignored)
-    if held:
-        raise InputError(f"cyclic: {what} holds {plain(held)}, which can therefore not be ignored")
+    cyclic = x.free_symbols & set(ignored)
+    if cyclic:
+        raise InputError(f"cyclic: {what} holds {plain(cyclic)}, which can therefore not be ignored")
 
 
 # The ignored coordinates of a reduced motion, by quadrature along it. The intervals between saved states do not depend
@@ -268,14 +268,14 @@ def _read(
     routhian: Routhian[Any], run: Any, values: Mapping[str, float]
 ) -> tuple[Array, Array, Array, dict[str, float]]:
     """Return t, q, v and the numbers of the reduced model's parameters without the time."""
-    model, held = routhian._model, {}
+    model, parameters = routhian._model, {}
     if hasattr(run, "tau") and hasattr(run, "model"):
         if np.any(run.tau):
             raise UnsupportedError(
                 "run: a torque acted on it, which is not known between its states; write it as one of the "
                 "Lagrangian's forces"
             )
-        held = dict(run.model.parameters)
+        parameters = dict(run.model.parameters)
         t, q, v = run.t, run.q, run.v
     else:
         try:
@@ -290,14 +290,14 @@ def _read(
     require_finite("run: t", t)
     q, v = (finite_array(f"run: {name}", x, (len(t), model.nq)) for name, x in (("q", q), ("v", v)))
     names = [p.name for p in routhian.lagrangian.parameters]
-    values = {**{n: x for n, x in held.items() if n in names and x is not None}, **values}
+    values = {**{n: x for n, x in parameters.items() if n in names and x is not None}, **values}
     numbers = parameter_values(routhian.lagrangian, values, "reconstruct")
     return t, q, v, dict(zip(names, numbers.tolist(), strict=True))
 
 
 def _start(routhian: Routhian[Any], q0: ArrayLike, q: Array) -> Array:
-    kept, ignored = routhian._places
-    whole = len(kept) + len(ignored)
+    remaining, ignored = routhian._places
+    whole = len(remaining) + len(ignored)
     start = np.asarray(q0, dtype=np.float64)
     if start.shape not in ((len(ignored),), (whole,)):
         raise InputError(
@@ -307,7 +307,7 @@ def _start(routhian: Routhian[Any], q0: ArrayLike, q: Array) -> Array:
     require_finite("q0", start)
     if len(start) < whole:
         return start
-    off = float(np.abs(start[kept] - q[0]).max())
+    off = float(np.abs(start[remaining] - q[0]).max())
     if off > _START_DIFFERENCE_RATIO * (1 + float(np.abs(q[0]).max())):
         names = ", ".join(x.name for x in routhian.lagrangian.coordinates)
         raise InputError(f"q0: its {names} differ from the run's first state by {off:.3g}")

@@ -375,8 +375,8 @@ class _Balance:
             if self._manifold is not None:
                 J = self._manifold.jacobian(q)
                 # Rows of velocities hold no configuration.
-                held = J[: len(r) - nv]
-                K = np.block([[K, -J.T], [held, np.zeros((len(held), len(J)))]])
+                position_rows = J[: len(r) - nv]
+                K = np.block([[K, -J.T], [position_rows, np.zeros((len(position_rows), len(J)))]])
             step = _damped(K, r, damping)
             ahead = self.model.integrate(q, step[:nv]), multipliers + step[nv:]
             new = self.residual(*ahead, tau)
@@ -395,8 +395,8 @@ class _Balance:
     def _left(self, r: Array, q: Array, tau: Array) -> tuple[float, float]:
         """Return the residual relative to its rounding: of the forces of each row, and beside those of all rows."""
         rows = self.scale(q, tau)[: len(r)]
-        beside = np.maximum(rows, _CANCELLED_FORCE_RATIO * rows.max(initial=0.0))
-        own, left = (float((np.abs(r) / (_BALANCE_RATIO * x)).max(initial=0.0)) for x in (rows, beside))
+        sizes = np.maximum(rows, _CANCELLED_FORCE_RATIO * rows.max(initial=0.0))
+        own, left = (float((np.abs(r) / (_BALANCE_RATIO * x)).max(initial=0.0)) for x in (rows, sizes))
         return own, left
 
     # Small motions

@@ -124,7 +124,7 @@ def newton_euler(
     into, R, m, down = read_bodies(masses, positions, PlainSymbols(coordinates, velocities, time), gravity)
     turns = turning(into, len(m), inertias, angular_velocities)
     own = accelerations_of(into.coordinates, into.velocities)
-    given = {
+    loads = {
         "forces": _given("forces", forces, [len(x) for x in R], into),
         "torques": _given("torques", torques, [len(t[1]) if t else 0 for t in turns], into),
     }
@@ -147,12 +147,12 @@ def newton_euler(
 
     for k, (mass, place) in enumerate(zip(m, R, strict=True)):
         velocity = rate(sp.Matrix(place))
-        force = given["forces"][k] + (mass * sp.Matrix(down) if down is not None else sp.zeros(len(place), 1))
+        force = loads["forces"][k] + (mass * sp.Matrix(down) if down is not None else sp.zeros(len(place), 1))
         add(mass * rate(velocity), force, velocity, "F", k)
         if (turn := turns[k]) is not None:
             A, w = turn
             spun = A * rate(w) + (w.cross(A * w) if len(w) == 3 else sp.zeros(1, 1))
-            add(spun, given["torques"][k], w, "N", k)
+            add(spun, loads["torques"][k], w, "N", k)
     P = sp.Matrix(speeds).jacobian(into.velocities)
     return FreeBodies(
         coordinates=into.coordinates,

@@ -69,8 +69,8 @@ def portrait(
     def on(x: sp.Expr, at: Array, speed: Array) -> Array:
         arguments = form.coordinates, form.velocities, tuple(form.parameters)
         with np.errstate(all="ignore"):
-            found = Numeric(sp.Matrix([x]), *arguments)(at.reshape(-1, 1), speed.reshape(-1, 1), numbers)
-        return np.asarray(found.reshape(at.shape))
+            evaluate = Numeric(sp.Matrix([x]), *arguments)(at.reshape(-1, 1), speed.reshape(-1, 1), numbers)
+        return np.asarray(evaluate.reshape(at.shape))
 
     e = form.equations()
     rate = e.applied[0].subs(dict.fromkeys(form.inputs.values(), 0)) / e.mass_matrix[0]
@@ -94,8 +94,8 @@ def portrait(
     else:
         ax.streamplot(Q[0], W[:, 0], W, drawn, density=_STREAM_DENSITY, color="C0", linewidth=0.9, arrowsize=0.8)
     for stable, filled in ((True, "C0"), (False, "none")):
-        there = rests[(slopes < 0) == stable]
-        ax.plot(there, 0 * there, "o", markerfacecolor=filled, markeredgecolor="C0" if stable else "C3")
+        places = rests[(slopes < 0) == stable]
+        ax.plot(places, 0 * places, "o", markerfacecolor=filled, markeredgecolor="C0" if stable else "C3")
     names = (written(s.name) for s in (*form.coordinates, *form.velocities))
     ax.set(xlim=bounds[0], ylim=bounds[1], title=form.name, **dict(zip(("xlabel", "ylabel"), names, strict=True)))
     return cast("Figure", ax.get_figure(root=True))

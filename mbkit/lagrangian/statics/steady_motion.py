@@ -122,7 +122,7 @@ def steady_motion(
     if system.time is not None:
         raise InputError(f"system: {system.name} depends on the time {system.time}, and no motion of it is steady")
     reduced = system.routhian()
-    kept, cyclic = reduced._places
+    remaining, cyclic = reduced._places
     start = _start(reduced, q0)
     if (momenta is None) == (rates is None):
         raise InputError("momenta: expected momenta or rates of the cyclic coordinates, one of the two")
@@ -132,16 +132,16 @@ def steady_motion(
     _complete("momenta", momenta, names)
     numbers = {name: real(f"momenta[{name}]", momenta[name]) for name in names}
     rest = equilibrium(_at(reduced.lagrangian, {**values, **numbers}), start, seed=seed)
-    still = np.zeros((1, len(kept)))
+    still = np.zeros((1, len(remaining)))
     turning = reduced._rates(np.zeros(1), rest.q[None], still, _numbers(reduced, {**values, **numbers}))[0]
     q, v = np.zeros(len(system.coordinates)), np.zeros(len(system.coordinates))
-    q[kept], v[cyclic] = rest.q, turning
+    q[remaining], v[cyclic] = rest.q, turning
     if turning.any():
-        steps = _NEIGHBOUR_RATIO * np.diag(np.maximum(1.0, abs(q)))[kept]
-        beside = np.concatenate([[q], q + steps, q - steps])
-        _refuse_pole(_at(system, values).mass_matrix(beside)[:, cyclic][:, :, cyclic], reduced, rest.q)
-    told = {s.name: float(x) for s, x in zip(reduced.cyclic, turning, strict=True)}
-    return SteadyMotion(rest, told, numbers, q, v)
+        steps = _NEIGHBOUR_RATIO * np.diag(np.maximum(1.0, abs(q)))[remaining]
+        neighbours = np.concatenate([[q], q + steps, q - steps])
+        _refuse_pole(_at(system, values).mass_matrix(neighbours)[:, cyclic][:, :, cyclic], reduced, rest.q)
+    rates_by_name = {s.name: float(x) for s, x in zip(reduced.cyclic, turning, strict=True)}
+    return SteadyMotion(rest, rates_by_name, numbers, q, v)
 
 
 def _at(system: Lagrangian, values: dict[str, float]) -> Dynamics:
@@ -149,12 +149,12 @@ def _at(system: Lagrangian, values: dict[str, float]) -> Dynamics:
     return dyn.at(**values) if values else dyn
 
 
-def _refuse_pole(beside: Array, reduced: Routhian[Any], q: Array) -> None:
+def _refuse_pole(neighbours: Array, reduced: Routhian[Any], q: Array) -> None:
     """Refuse a place where cyclic coordinates turn about one axis, or one turns nothing (NumericalError).
 
     `beside` are the mass matrices of cyclic coordinates there, first, and at places beside it.
     """
-    M, around = beside[0], np.diagonal(beside, axis1=1, axis2=2).max(axis=0)
+    M, around = neighbours[0], np.diagonal(neighbours, axis1=1, axis2=2).max(axis=0)
     still = [
         x.name
         for x, own, most in zip(reduced.cyclic, np.diag(M), around, strict=True)
@@ -181,19 +181,19 @@ def _numbers(reduced: Routhian[Any], values: Mapping[str, float]) -> dict[str, f
 def _start(reduced: Routhian[Any], q0: ArrayLike | None) -> Array | None:
     if q0 is None:
         return None
-    kept, _ = reduced._places
+    remaining, _ = reduced._places
     whole, name = len(reduced.system.coordinates), reduced.system.name
     start = real_array("q0", q0)
     if start.shape == (whole,):
-        return start[kept]
-    return rows("q0", start, len(kept), name, "coordinates that are not cyclic")
+        return start[remaining]
+    return rows("q0", start, len(remaining), name, "coordinates that are not cyclic")
 
 
-def _complete(what: str, given: Mapping[Any, float], names: list[str]) -> None:
-    if not isinstance(given, Mapping):
-        raise InputError(f"{what}: expected a mapping of names to numbers, got {given!r}")
-    require_known(what, names, *given)
-    missing = [name for name in names if name not in given]
+def _complete(what: str, values: Mapping[Any, float], names: list[str]) -> None:
+    if not isinstance(values, Mapping):
+        raise InputError(f"{what}: expected a mapping of names to numbers, got {values!r}")
+    require_known(what, names, *values)
+    missing = [name for name in names if name not in values]
     if missing:
         raise InputError(f"{what}: expected a number for each of {', '.join(names)}, got none for {', '.join(missing)}")
 
@@ -211,14 +211,14 @@ def _of_rates(
         {name_of(key): real(f"rates[{key}]", x) for key, x in rates.items()} if isinstance(rates, Mapping) else rates
     )
     _complete("rates", named, [q.name for q in reduced.cyclic])
-    kept, cyclic = reduced._places
+    remaining, cyclic = reduced._places
     put = {system.velocities[i]: sp.Float(named[q.name], 17) for i, q in zip(cyclic, reduced.cyclic, strict=True)}
-    forces = {system.coordinates[i]: system.forces[i].subs(put) for i in kept}
+    forces = {system.coordinates[i]: system.forces[i].subs(put) for i in remaining}
     driven = Lagrangian(
         system.T.subs(put),
         system.V,
-        [system.coordinates[i] for i in kept],
-        [system.velocities[i] for i in kept],
+        [system.coordinates[i] for i in remaining],
+        [system.velocities[i] for i in remaining],
         forces={q: x for q, x in forces.items() if x != 0},
         parameters=system.parameters,
         constraints=system.constraints,
@@ -227,5 +227,5 @@ def _of_rates(
     )
     rest = equilibrium(_at(driven, values), start, seed=seed)
     q, v = np.zeros(len(system.coordinates)), np.zeros(len(system.coordinates))
-    q[kept], v[cyclic] = rest.q, [named[x.name] for x in reduced.cyclic]
+    q[remaining], v[cyclic] = rest.q, [named[x.name] for x in reduced.cyclic]
     return rest.q, dict(reduced.reduce(q, v, **values).values)

@@ -59,7 +59,7 @@ def shortest_form(x: TrigPolynomial, *, whole: bool = True, decimals: bool = Tru
     forms = [_joined(map(_fewest_terms, parts))]
     if whole and len(parts) > 1 and (angles := _split_off(x)):
         # A factor such as sin θ shows in all parts only where sin 2θ is written by it.
-        forms += [_joined(power_form(part, tuple(angles), kept) for part in parts) for kept in (0, 1)]
+        forms += [_joined(power_form(part, tuple(angles), square) for part in parts) for square in (0, 1)]
     write = _Writer(x.space, whole, decimals).expression
     return min((write(form) for form in forms), key=complexity)
 
@@ -79,7 +79,7 @@ def _fewest_terms(x: TrigPolynomial) -> Form:
     angles = _split_off(x)
     subsets = (subset for n in range(len(angles) + 1) for subset in combinations(angles, n))
     # The square that stays, of cosines (0) or sines (1); neither is shorter always.
-    return min((power_form(x, subset, kept) for subset in subsets for kept in (0, 1)), key=len)
+    return min((power_form(x, subset, square) for subset in subsets for square in (0, 1)), key=len)
 
 
 class _Writer:
@@ -177,7 +177,7 @@ FormKey = tuple[tuple[tuple[int, int, int], ...], int, tuple[int, ...], tuple[in
 Form = dict[FormKey, Fraction]
 
 
-def power_form(x: TrigPolynomial, subset: tuple[int, ...], kept: int) -> Form:
+def power_form(x: TrigPolynomial, subset: tuple[int, ...], square: int) -> Form:
     """Return a form: Re or Im of Π (cos a + i sin a)^k (cos rest + i sin rest), power by power."""
     out: Form = {}
     for (kind, multiples, powers), value in x.terms.items():
@@ -189,7 +189,7 @@ def power_form(x: TrigPolynomial, subset: tuple[int, ...], kept: int) -> Form:
             parts = [
                 ((*done, (i, c, s)) if c or s else done, turns + (s if k > 0 else -s), factor * times)
                 for done, turns, factor in parts
-                for (c, s), times in _power(abs(k), kept).items()
+                for (c, s), times in _power(abs(k), square).items()
             ]
         for done, turns, factor in parts:
             for part in (0, 1) if any(rest) else (0,):
