@@ -328,8 +328,14 @@ def test_runs_of_equal_cranks_are_those_of_one_freedom(method: str) -> None:
     exact = solve_ivp(
         lambda _, y: [y[1], swing(y[0])], (0, duration), [THETA, 0], "DOP853", grid, rtol=1e-13, atol=1e-14
     )
-    close = 1e-9 if method in ("rk853", "taylor") else 1e-5
-    assert np.abs(run.q - np.outer(exact.y[0], [1, 1, 1, -1])).max() < close
+    exact_q, close = np.outer(exact.y[0], [1, 1, 1, -1]), 1e-9 if method in ("rk853", "taylor") else 1e-5
+    if method == "implicit_midpoint":
+        # Order 2 is off by 3.3e-5 at this step, and no bar of 1e-5 can hold. As the rule is symmetric, its error is a
+        # series in dt²: half the step has a quarter of it, up to dt⁴.
+        half = mb.simulate(dyn, run.q[0], run.v[0], duration, method, save=grid, dt=1e-3)
+        assert half.q - exact_q == pytest.approx((run.q - exact_q) / 4, abs=1e-9)
+        close = 4e-5
+    assert np.abs(run.q - exact_q).max() < close
     energy = run.energy()
     assert np.abs(energy - energy[0]).max() < (1e-10 if method in ("rk853", "taylor") else 1e-3)
 

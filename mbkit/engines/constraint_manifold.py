@@ -7,7 +7,7 @@ pose: a set may have full rank on one branch of a mechanism only (a row of equal
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -218,6 +218,10 @@ class Manifold:
             q1, v1, moved, far = (x[..., 0] for x in self.call("projection", q, v1, moved))
             if not far.any():
                 break
+        # At a singular pose rounding would move it by any amount.
+        if not np.abs(v1 - v).max(initial=0.0) <= CONSISTENT * np.abs(v).max(initial=0.0):
+            stays = self.at_pose(q)[..., None]
+            q1, v1 = np.where(stays, q, q1), np.where(stays, v, v1)
         return q1, v1
 
     def beside(self, q: Array, v: Array) -> tuple[Array, Array]:
@@ -229,6 +233,18 @@ class Manifold:
     def dependence(self, q: Array) -> Array:
         """Return how nearly rows of J depend on each other, of one state or each of a batch."""
         return self.call("dependence", q)[0][..., 0, 0]
+
+    def nears_pose(self, t: float, q: Array, h: float, end: Array) -> NDArray[np.bool_]:
+        """Return whether a step, or each of a batch, would meet a singular pose within a few more of its kind.
+
+        The states at its start, end and middle alone decide, so that one step is the same wherever it is taken; the
+        start and the end may be as far from a pose between them.
+        """
+        model = self.dyn.model
+        middle = model.integrate(q, 0.5 * model.difference(end, q))
+        start, *others = (self.at(t + c * h).dependence(x) for c, x in ((0.0, q), (0.5, middle), (1.0, end)))
+        near: NDArray[np.bool_] = nears_singular(start, others[0]) | nears_singular(start, others[1])
+        return near
 
     def at_pose(self, q: Array) -> NDArray[np.bool_]:
         """Return whether a configuration, or each of a batch, is a singular pose up to rounding."""
@@ -334,37 +350,6 @@ def manifold_of(dyn: Dynamics) -> Manifold:
     if _TWIN not in vars(dyn):
         vars(dyn)[_TWIN] = LagrangianDynamics(dyn.model)
     return Manifold(vars(dyn)[_TWIN])
-
-
-#: take(near) -> (q1, w1, last): a step and the configuration of its last stage. Where it is near a singular pose, its
-#: stages are projected. None where it fails.
-Attempt = Callable[[bool], "tuple[Array, Array, Array] | None"]
-
-
-def explicit_step(
-    dyn: Dynamics, formula: Any, t: float, h: float, q: Array, take: Attempt
-) -> tuple[Array, Array] | None:
-    """Take an explicit step under constraints, of one state or a batch; its end is still to be projected.
-
-    The formula of `mbkit.derivation.steps.fixed`: near a singular pose f̈ = 0 divides the stages' errors by J's smallest
-    singular value, and they are projected. What decides is the state at the step's start and end alone, so that one
-    step is the same wherever it is taken.
-    """
-    plain = take(False)
-    if plain is None:
-        near = np.full(q.shape[:-1], True)
-    else:
-        q1, w1, last = plain
-        end = last if formula.ends_at_a_stage else q1
-        states = manifold_of(dyn)
-        near = nears_singular(states.at(t).dependence(q), states.at(t + h).dependence(end))
-        if not near.any():
-            return q1, w1
-    careful = take(True)
-    if careful is None or plain is None:
-        return None if careful is None else careful[:2]
-    which = near[..., None]
-    return np.where(which, careful[0], q1), np.where(which, careful[1], w1)
 
 
 def projected(dyn: Dynamics, q: Array, v: Array, hold: Sequence[str] = ()) -> tuple[Array, Array]:

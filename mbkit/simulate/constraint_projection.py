@@ -2,10 +2,10 @@
 
 The equation of motion holds f̈ = 0 only, so that f and ḟ drift. One-step methods project each step's end, by Newton's
 iteration with the mass matrix as the weight; it moves a state by the step's own error, so that the order stays. Near a
-singular pose explicit methods project their stages too, since f̈ = 0 divides their errors by J's smallest singular
-value; other methods with a tolerance leave the way across it to rk853. A projection would spoil the history of
-multistep methods (BDF, LSODA): only their kept states have it. An engine with soft constraints projects
-nothing: how far its states leave the constraints is part of its answer.
+singular pose f̈ = 0 divides the errors of stages by J's smallest singular value: rk853 projects its stages too, other
+methods with a tolerance leave the way across it to rk853, and fixed steps are those of Gauss's collocation. A
+projection would spoil the history of multistep methods (BDF, LSODA): only their kept states have it. An engine with
+soft constraints projects nothing: how far its states leave the constraints is part of its answer.
 """
 
 from __future__ import annotations

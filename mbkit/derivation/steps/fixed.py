@@ -6,7 +6,7 @@ the step.
 Under constraints the stages are those of the method, and the end is projected as in
 `mbkit.derivation.steps.onto_constraints`. Its first stage and its last one, or its end where no stage is there, tell
 whether a step is near a singular pose (`nears_singular`). Such a step is lost here, and taken by
-`mbkit.engines.constraint_manifold.explicit_step`, which projects the stages too.
+`mbkit.simulate.solvers.fixed_step.make_step`, by collocation.
 """
 
 from __future__ import annotations

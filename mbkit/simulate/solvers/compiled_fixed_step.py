@@ -194,7 +194,7 @@ def run_rollout(
         if problem.torque.samples is None:
             suspects = suspects_of(suspects, thorough=True)
         if len(suspects):
-            # Near a singular pose stages are projected too, and the pose is named. The others of a batch are done.
+            # Near a singular pose steps are of collocation, and the pose is named. The others of a batch are done.
             return run_fixed(problem, record, suspects)
     if len(suspects):
         plan = dyn._step_plan(method, fed=law is not None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,11 @@ from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError
 from mbkit.methods.one_step import ArrayStages, SemiImplicitEuler
 from mbkit.methods.registry import method_of
-from mbkit.methods.tableaus import ImplicitTableau, Tableau
+from mbkit.methods.tableaus import ImplicitTableau, Tableau, gauss_legendre
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.singular_poses import SingularPosesOfBatch
+from mbkit.simulate.singular_poses import SingularPosesOfBatch, manifold_at
 from mbkit.simulate.solvers.gauss import CollocationStep
 from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.solvers.vector_field import ALL, DIVERGED, DivergenceError, Field, are_bounded
@@ -26,6 +26,10 @@ from mbkit.simulate.torque import Force
 
 #: step(t, h, q, w, force) -> (q, w) at t + h; one state or a batch
 Step = Callable[[float, float, Array, Array, Force], tuple[Array, Array]]
+#: How often a step near a singular pose is split in two, and the part that comes first: a pose at a stage of Gauss's
+#: three is at none of either part.
+_SPLITS: Final = 4
+_FIRST_PART: Final = 0.4
 
 
 def to_body_velocity(space: Space, q: Array, w: Array) -> Array:
@@ -183,8 +187,7 @@ class SteppedRun:
             q, w = step(t, h, self._q, self._w, torque.during(k, self._members))
             good = are_bounded(q, w)
         except DivergenceError as error:
-            q, w, good = self._one_by_one(t, h, k)
-            why = str(error)
+            q, w, good, why = self._one_by_one(t, h, k, str(error))
         if good is not ALL and not good.all():
             if self._members is None:
                 self.why = why or step.reason(self._q, self._w)
@@ -203,21 +206,22 @@ class SteppedRun:
             self._row += 1
         return True
 
-    def _one_by_one(self, t: float, h: float, k: int) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def _one_by_one(self, t: float, h: float, k: int, why: str) -> tuple[Array, Array, NDArray[np.bool_], str]:
         # One divergence must not stop the others of a batch: each steps by itself.
         q, w = np.full(self._q.shape, np.nan), np.full(self._w.shape, np.nan)
         if self._members is None:
-            return q, w, np.array(False)
+            return q, w, np.array(False), why
+        reasons = list[str]()
         for i in range(len(q)):
             one = slice(i, i + 1)
             self._step.only(self._members[one])
             force = self._problem.torque.during(k, self._members[one])
             try:
                 q[one], w[one] = self._step(t, h, self._q[one], self._w[one], force)
-            except DivergenceError:
-                continue
+            except DivergenceError as error:
+                reasons.append(str(error))
         self._step.only(self._members)
-        return q, w, are_bounded(q, w)
+        return q, w, are_bounded(q, w), next(iter(reasons), "")
 
 
 def divergence_reason(dyn: Dynamics, method: str, t: float, h: float, q: Array, w: Array, force: Array) -> str:
@@ -232,46 +236,65 @@ def divergence_reason(dyn: Dynamics, method: str, t: float, h: float, q: Array, 
 
 
 def make_step(method: str, field: Field, space: Space) -> Step:
-    """Return the step of a fixed-step method."""
+    """Return the step of a fixed-step method, of one state or a batch; under constraints its end is to be projected.
+
+    f̈ = 0 divides the stages' distance from the constraints by J's smallest singular value. Near a singular pose a step
+    is one of Gauss's collocation, whose stages are close to the motion, and none at an end that may be the pose; where
+    one comes close to it all the same, it is two such steps, whose stages are elsewhere.
+    """
     formula = method_of(method).formula
     if isinstance(formula, ImplicitTableau):
-        return CollocationStep(formula, field, space)
-    assert isinstance(formula, (Tableau, SemiImplicitEuler))
-    explicit, stages = formula, ArrayStages(formula.stages, (space.nv,))
+        attempt: Step = CollocationStep(formula, field, space)
+    else:
+        assert isinstance(formula, (Tableau, SemiImplicitEuler))
+        attempt = _ExplicitStep(formula, field, space)
+    collocation = CollocationStep(gauss_legendre(3), field, space)
 
-    def attempt(t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array, Array]:
-        last = q
-
-        def rates(t: float, q: Array, u: Array | None, w: Array) -> tuple[Array, Array]:
-            nonlocal last
-            last = q
-            return w if u is None else space.rate(u, w), field.consistent(t, q, w, force)
-
-        nonlocal stages
-        if stages.shape != w.shape:
-            stages = ArrayStages(explicit.stages, w.shape)
-        stages.keep(0)
-        q, w, _ = explicit.step(space, rates, stages, t, h, q, w)
-        return q, w, last
+    def near_pose(t: float, h: float, q: Array, w: Array, force: Force, splits: int) -> tuple[Array, Array]:
+        field.near = True
+        try:
+            return collocation(t, h, q, w, force)
+        except DivergenceError:
+            if not splits:
+                raise
+        first = _FIRST_PART * h
+        q, w = field.settled(t + first, *near_pose(t, first, q, w, force, splits - 1))
+        return near_pose(t + first, h - first, q, w, force, splits - 1)
 
     def step(t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
         field.near = False
         if not field.projects:
-            return attempt(t, h, q, w, force)[:2]
-
-        def take(near: bool) -> tuple[Array, Array, Array] | None:
-            field.near = near
-            try:
-                return attempt(t, h, q, w, force)
-            except DivergenceError:
-                if near:
-                    raise
-                return None
-
-        from mbkit.engines.constraint_manifold import explicit_step
-
-        taken = explicit_step(field.dyn, explicit, t, h, q, take)
-        assert taken is not None
-        return taken
+            return attempt(t, h, q, w, force)
+        alone = q.size == q.shape[-1]
+        splits = _SPLITS if alone else 0
+        try:
+            q1, w1 = attempt(t, h, q, w, force)
+        except DivergenceError:
+            # Each of a batch is then asked by itself.
+            if not alone:
+                raise
+            return near_pose(t, h, q, w, force, splits)
+        near = manifold_at(field.dyn, t).nears_pose(t, q, h, q1)
+        if not near.any():
+            return q1, w1
+        careful = near_pose(t, h, q, w, force, splits)
+        return np.where(near[..., None], careful[0], q1), np.where(near[..., None], careful[1], w1)
 
     return step
+
+
+class _ExplicitStep:
+    """A step of an explicit method."""
+
+    def __init__(self, formula: Tableau | SemiImplicitEuler, field: Field, space: Space) -> None:
+        self._formula, self._field, self._space = formula, field, space
+        self._stages = ArrayStages(formula.stages, (space.nv,))
+
+    def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
+        def rates(t: float, q: Array, u: Array | None, w: Array) -> tuple[Array, Array]:
+            return w if u is None else self._space.rate(u, w), self._field(t, q, w, force)
+
+        if self._stages.shape != w.shape:
+            self._stages = ArrayStages(self._formula.stages, w.shape)
+        self._stages.keep(0)
+        return self._formula.step(self._space, rates, self._stages, t, h, q, w)[:2]

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mbkit._check import Array
 from mbkit.methods.tableaus import ImplicitTableau
 from mbkit.model.integration_space import Space
+from mbkit.simulate.singular_poses import LOOSEST
 from mbkit.simulate.solvers.vector_field import DIVERGED, DivergenceError, Field
 from mbkit.simulate.torque import Force
 
@@ -30,6 +31,8 @@ _SLOW: Final = 0.05
 # or where they move the configuration by less than this, in rad or m.
 _ROUNDING: Final = 1e-11
 _LEAST: Final = 1e-13
+#: Of a step: times that differ by less are one.
+_SAME_TIME: Final = 1e-9
 _UNSOLVED: Final = "the iteration does not solve the equations of the step's stages"
 
 
@@ -44,9 +47,9 @@ class _Start(NamedTuple):
 
 
 class _Past(NamedTuple):
-    """The last step: where it ended, the stages' ẇ, its length, and Newton's matrix if there was one."""
+    """A step: when it ended, the stages' ẇ, its length, and Newton's matrix if there was one."""
 
-    q: Array
+    end: float
     rates: Array
     h: float
     inverse: Array | None
@@ -62,24 +65,28 @@ class CollocationStep:
         self._A, self._b, self._c, self._s = tableau.A, tableau.b, tableau.c, tableau.stages
         self._times = tableau.c.tolist()
         self._field, self._space, self._nv = field, space, space.nv
-        self._past: _Past | None = None
+        # The last step, and the one before, from which it may be tried again.
+        self._past: list[_Past] = []
 
     def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
         """Return q and w after a step of h seconds."""
-        start, past = _Start(t, h, q, w, force), self._past if self._past is not None and self._past.q is q else None
-        rates, inverse = self._solved(start, self._guess(h, w, past), past.inverse if past and past.h == h else None)
+        start = _Start(t, h, q, w, force)
+        past = next((x for x in self._past if abs(x.end - t) < _SAME_TIME * h and x.rates.shape[1:] == w.shape), None)
+        rates, inverse = self._solved(start, self._guess(start, past), past.inverse if past and past.h == h else None)
         moved = _mixed(h * self._b, rates)
         q1 = self._space.retract(q, moved[..., : self._nv])
-        self._past = _Past(q1, rates[..., self._nv :], h, inverse)
+        self._past = [_Past(t + h, rates[..., self._nv :], h, inverse), *([] if past is None else [past])]
         return q1, w + moved[..., self._nv :]
 
-    def _guess(self, h: float, w: Array, past: _Past | None) -> Array:
-        # The polynomial through the last step's ẇ, continued.
-        nv = self._nv
+    def _guess(self, start: _Start, past: _Past | None) -> Array:
+        # The polynomial through the last step's ẇ, continued; of a first step the ẇ at its start.
+        nv, w = self._nv, start.w
         rates = np.zeros((self._s, *w.shape[:-1], 2 * nv))
         if past is not None:
-            rates[..., nv:] = _mixed(self._continued(h / past.h), past.rates)
-        rates[..., :nv] = w + _mixed(h * self._A, rates[..., nv:])
+            rates[..., nv:] = _mixed(self._continued(start.h / past.h), past.rates)
+        else:
+            rates[..., nv:] = self._field(start.t, start.q, w, start.force)
+        rates[..., :nv] = w + _mixed(start.h * self._A, rates[..., nv:])
         return rates
 
     def _continued(self, ratio: float) -> Array:
@@ -160,7 +167,11 @@ class CollocationStep:
             factor = size / last
             rest = size * factor / (1 - factor)
         done = (size <= _EPS * speed) | (measurable & (factor < 1) & (rest <= _EPS / 4 * speed))
-        done |= measurable & (factor > 0.5) & ((size <= _ROUNDING * speed) | (start.h * size <= _LEAST))
+        done |= (
+            measurable
+            & (factor > 0.5)
+            & ((size <= (LOOSEST if self._field.near else _ROUNDING) * speed) | (start.h * size <= _LEAST))
+        )
         return done, measurable & ~(factor < _SLOW)
 
     def _size(self, h: float, rates: Array) -> Array:

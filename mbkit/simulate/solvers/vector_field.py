@@ -48,7 +48,7 @@ def are_bounded(q: Array, w: Array) -> NDArray[np.bool_]:
 class Field:
     """ẇ of the integrators' state, from an engine's forward dynamics; `evaluations` are summed over a batch.
 
-    Without a space, w is mbkit's v. Under constraints an explicit method's stages near a singular pose are projected:
+    Without a space, w is mbkit's v. Under constraints the stages of a step near a singular pose are projected:
     a fixed step says by `near` whether it is, and an adaptive run looks ahead.
     """
 
@@ -103,7 +103,7 @@ class Field:
         return q, self._space.to_integrator_velocity(q, v)
 
     def consistent(self, t: float, q: Array, w: Array, force: Force) -> Array:
-        """Return ẇ at an explicit method's stage; near a singular pose at the state on the constraints beside it."""
+        """Return ẇ at a stage; near a singular pose at the state on the constraints beside it."""
         if self.near_singular:
             # One of a batch with parameters of its own is a batch of one.
             q, w = (x.reshape(y.shape) for x, y in zip(self._projected(beside, t, q, w), (q, w), strict=True))
