@@ -151,25 +151,6 @@ def test_momentum_changes_by_weight_wrenches_and_the_loads_of_the_ground(name):
     assert off(change, out) < CLOSE
 
 
-@pytest.mark.thorough("all joint types", "floating", "sound")
-@pytest.mark.parametrize("name", TREES)
-def test_the_whole_has_the_mass_weight_and_momentum_of_its_parts(name):
-    model, (q, v, _, _) = tree(name), at(name).values()
-    dyn = mb.dynamics(model, "lagrangian")
-    weight = model.mass * model.gravity
-    J, A = dyn.center_of_mass_jacobian(q), dyn.centroidal_momentum_matrix(q)
-    still = mb.dynamics(model.without("springs"), "lagrangian") if model.needs.springs else dyn
-    assert off(still.potential_energy(q), -dyn.center_of_mass(q) @ weight) < CLOSE
-    assert off(dyn.gravity(q), -np.einsum("nij,i->nj", J, weight)) < CLOSE
-    assert off(A[:, :3], model.mass * J) < CLOSE
-    assert off(np.einsum("nij,nj->ni", A, v), dyn.centroidal_momentum(q, v)) < CLOSE
-    assert off(np.einsum("nij,nj->ni", J, v), dyn.center_of_mass_velocity(q, v)) < CLOSE
-    locked = dyn.locked_inertia(q)
-    assert np.array_equal(locked[0, :3, :3], locked[0, 0, 0] * np.eye(3))
-    assert locked[0, 0, 0] == pytest.approx(model.mass, rel=1e-14)
-    assert np.linalg.eigvalsh(locked).min() > 0
-
-
 @pytest.mark.parametrize("name", ["all joint types", "floating"])
 def test_wrenches_do_the_work_of_their_generalized_force(name):
     model, (q, v, _, _) = tree(name), at(name).values()
@@ -197,21 +178,6 @@ def test_wrenches_and_jacobians_have_one_default(engine):
     defaults.append(inspect.signature(mb.simulate).parameters["wrench_axes"].default)
     assert len(defaults) > 9
     assert set(defaults) == {ALIGNED}
-
-
-def test_a_load_along_the_joint_is_its_force():
-    """Less what the rotor takes; springs between points are no part of a joint."""
-    model = random_tree(6, 9, ALL, springs=False, damping=False)
-    q, v, a, _ = states(model, 2)
-    for engine in ("lagrangian", "pinocchio"):
-        dyn = mb.dynamics(model, engine)
-        force = dyn.inverse_dynamics(q, v, a)
-        carried = dyn.joint_wrenches(q, v, a)
-        for joint, load in zip([j for j in model.joints if j.type.nv], carried.swapaxes(0, 1), strict=True):
-            own = model.layout.full_v[joint.name]
-            along = dyn.jacobian(q, joint.child, LOCAL)[:, :, own]
-            expected = force[:, own] - joint.armature * a[:, own]
-            assert off(np.einsum("nij,ni->nj", along, load), expected) < CLOSE, joint.name
 
 
 @pytest.mark.thorough("floating-lagrangian", "floating-mujoco", "floating-drake")

@@ -47,7 +47,7 @@ def assert_refused(kind: type[Exception], ask: Callable[[], object], words: list
 # Edit
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(SEEDS)
 def test_a_builder_of_a_model_builds_the_same_model(seed):
     model = random_tree(seed, 8, mimic=True)
@@ -115,7 +115,7 @@ def test_a_parameter_takes_the_place_of_a_number_and_a_number_that_of_a_paramete
 
 
 @pytest.mark.thorough
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(SEEDS)
 def test_a_payload_adds_its_inertia_by_the_jacobian_of_its_frame(seed):
     tree = random_tree(seed, 6, kinds=SOUND)
@@ -160,7 +160,7 @@ def test_a_removed_joint_takes_all_that_it_carries():
 
 
 @pytest.mark.thorough
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(SEEDS)
 def test_a_prefix_changes_names_alone(seed):
     tree = random_tree(seed, 6, mimic=True)
@@ -247,7 +247,7 @@ def assert_same_as(raw: pin.Model, dyn: mb.Dynamics, q: np.ndarray, v: np.ndarra
     assert off(dyn.nle(q, v), pin.nonLinearEffects(raw, data, pin_q, pin_v)[order]) < CLOSE
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(SEEDS, st.data())
 def test_a_locked_model_has_the_rows_and_columns_that_are_left(seed, data):
     tree = random_tree(seed, 6, mimic=True)
@@ -398,7 +398,7 @@ def test_what_cannot_be_locked_is_refused(ask, words):
 
 
 @pytest.mark.thorough
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(SEEDS)
 def test_two_trees_joined_have_the_arm_s_terms_in_their_block(seed):
     base, arm = random_tree(seed, 5, kinds=SOUND), random_tree(seed + 1, 5, kinds=SOUND)
@@ -493,7 +493,7 @@ def test_what_cannot_be_joined_is_refused(ask, words):
 
 
 @pytest.mark.thorough
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(SEEDS)
 def test_free_numbers_have_their_values_until_others_are_given(seed):
     tree = random_tree(seed, 5, mimic=True)
@@ -590,7 +590,7 @@ def test_the_same_seed_draws_the_same_whatever_else_varies(tmp_path):
     assert pickle.loads(pickle.dumps(two))[3] == two[3]
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(SEEDS, st.floats(0.01, 2.0))
 def test_every_drawn_body_can_be(seed, spread):
     tree = random_tree(seed, 3)

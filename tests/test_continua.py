@@ -251,13 +251,6 @@ def test_the_energy_of_a_beam_is_that_of_its_points_to_second_order(space):
         assert abs(a0 - b0) < 1e-14 * abs(a0)
 
 
-def test_without_stiffening_the_energy_is_that_of_points_that_move_across_only():
-    th = sp.Symbol("theta")
-    found = beam(L, EI, rho, rotation=th, coordinates=[th], stiffening=False).discretized([(s / L) ** 2])
-    turn = sp.Symbol("thetadot")
-    assert sp.expand(found.T.coeff(turn**2)).coeff(sp.Symbol("a1") ** 2) == L * rho / 10
-
-
 @pytest.mark.thorough
 def test_the_spin_up_of_kane_ryan_and_banerjee():
     times = np.linspace(0, beams.RISE, 31)
@@ -268,17 +261,6 @@ def test_the_spin_up_of_kane_ryan_and_banerjee():
     own, oracle = (lag.dynamics(e).at(t=3.0) for e in ("lagrangian", "oracle"))
     state = np.array([0.3, 0.1, -0.1]), np.array([0.2, 0.1, 0.1]), np.zeros(3)
     assert np.abs(own.forward_dynamics(*state) - oracle.forward_dynamics(*state)).max() < 1e-12
-
-
-def test_chains_of_rigid_segments_come_to_the_beam_as_the_square_of_their_length():
-    exact = float(beams.cantilever(beams.EI, beams.DENSITY, beams.LENGTH, 0, 0, 1)[0])
-    for engine in ("pinocchio", "mujoco"):
-        errors = []
-        for n in (6, 12):
-            M = mb.dynamics(flexible.rotor(1).segmented(n), engine).mass_matrix(np.zeros(n + 1))[1:, 1:]
-            K = np.eye(n) * beams.EI * n / beams.LENGTH
-            errors.append(np.sqrt(np.linalg.eigvals(np.linalg.solve(M, K)).real.min()) / exact - 1)
-        assert 1.9 < np.log2(errors[0] / errors[1]) < 2.1
 
 
 def test_the_chain_of_the_study_of_a_turning_hub_in_numbers():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -11,7 +10,7 @@ import mbkit as mb
 from mbkit.codegen.extended_precision import Extended, arithmetic
 from mbkit.codegen.program import program
 from mbkit.errors import InputError, NumericalError
-from tests.random_trees import off, random_tree, states
+from tests.random_trees import random_tree, states
 from tests.scenes import mounted
 
 EPS = np.finfo(float).eps
@@ -124,16 +123,6 @@ def test_gravity_and_springs_are_the_slope_of_the_potential(tree):
     close(dyn.gravity(q) - dyn.passive(q, 0 * v), slope)
 
 
-@pytest.mark.thorough("deep", "mimic", "free and balls")
-def test_the_tangent_is_that_of_the_models_integrate(tree):
-    model, dyn, (q, v, a, _) = tree
-    h = 1e-3
-    ends = [dyn.inverse_dynamics(model.integrate(q, s * h * np.eye(model.nv)), v, a) for s in (-2, -1, 1, 2)]
-    numeric = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]).T / (12 * h)
-    # The rule is good to h⁴ times a fifth derivative, which turns by a few radians per radian.
-    assert off(numeric.ravel(), dyn.inverse_dynamics_derivatives(q, v, a).q.ravel()) < 1e3 * h**4
-
-
 @pytest.mark.thorough("anymal_b-True")
 @pytest.mark.parametrize(("robot", "floating"), [("ur5", False), ("panda", False), ("anymal_b", True)])
 def test_pinocchio_gives_the_same(robot, floating):
@@ -162,19 +151,6 @@ def test_pinocchio_gives_the_same(robot, floating):
         close(x, y, k=condition)
 
 
-def test_fields_and_functions_are_named():
-    dyn = mb.dynamics(mb.load("ur5"), "lagrangian")
-    q, v, a, tau = (x[0] for x in states(dyn.model, 1))
-    for name, third, value in (("inverse_dynamics", "a", a), ("forward_dynamics", "tau", tau)):
-        result = getattr(dyn, f"{name}_derivatives")(q, v, value)
-        assert result._fields == ("q", "v", third)
-        f = dyn.function(f"{name}_derivatives")
-        assert isinstance(f, ca.Function)
-        got = f(q=q, v=v, **{third: value})
-        for field, x in result._asdict().items():
-            assert off(got[f"by_{field}"], x) < 10 * EPS
-
-
 def test_compiled_derivatives_are_those_interpreted():
     model = random_tree(9, 2, ("revolute", "ball"))
     q, v, a, tau = states(model, 5)
@@ -187,15 +163,6 @@ def test_compiled_derivatives_are_those_interpreted():
     ours, theirs = (d.forward_dynamics_derivatives(q, v, tau) for d in (fast, slow))
     for x, y in zip(ours, theirs, strict=True):
         close(x, y, k=condition)
-
-
-def test_parameters_are_arguments_of_derivatives_too():
-    q, v, x = [0.3, -0.5], [1.0, 2.0], [0.1, 0.2]
-    named = mb.dynamics(mb.catalog.double_pendulum(mass1=mb.Parameter("m", 2.0)), "lagrangian").at(m=3.0)
-    plain = mb.dynamics(mb.catalog.double_pendulum(mass1=3.0), "lagrangian")
-    for method in ("inverse_dynamics_derivatives", "forward_dynamics_derivatives"):
-        for ours, theirs in zip(getattr(named, method)(q, v, x), getattr(plain, method)(q, v, x), strict=True):
-            close(ours, theirs)
 
 
 def test_bad_input_and_singular_poses_are_named():

@@ -15,7 +15,7 @@ import pytest
 import mbkit as mb
 from mbkit import catalog
 from mbkit.engines import Dynamics, dynamics
-from mbkit.errors import InputError, MbkitWarning, TorqueError
+from mbkit.errors import MbkitWarning
 from mbkit.methods.registry import Tolerances
 from mbkit.methods.tableaus import dormand_prince_853
 from mbkit.model import Model, ModelBuilder
@@ -27,7 +27,6 @@ from mbkit.simulate.solvers.adaptive_compiled import CompiledAttempts
 from mbkit.simulate.solvers.step_attempts import RungeKuttaAttempts
 from mbkit.simulate.solvers.trajectory_record import AcceptedSteps
 from mbkit.simulate.torque import Torque
-from tests.random_trees import SOUND, random_tree
 from tests.scenes import mounted
 
 EPS = np.finfo(float).eps
@@ -207,24 +206,6 @@ def test_tolerances_at_rounding_do_not_stall(kind: str) -> None:
     assert np.abs(run.q - close.q).max() < 1e-12
 
 
-@pytest.mark.parametrize("engine", ["pinocchio", "lagrangian", "mujoco", "oracle"])
-def test_every_engine_has_it(engine: str) -> None:
-    model, q, v = CASES["double_pendulum"]
-    run = simulate(dynamics(model, engine), q, v, 0.2, "rk853", rtol=1e-11, save=[0.2])
-    exact = simulate(dynamics(model, "pinocchio"), q, v, 0.2, "dop853", rtol=1e-13, save=[0.2])
-    assert np.abs(run.q - exact.q).max() < 1e-11
-
-
-@pytest.mark.thorough
-def test_a_random_tree_moves_alike_in_lanes_and_stages() -> None:
-    model = random_tree(2, 6, SOUND)
-    q, v = model.random_state(2)
-    runs = [simulate(dyn, q, 0.3 * v, 0.05, "rk853", rtol=1e-12, save=[0.05]) for dyn in both(model).values()]
-    for i in (0, 1):
-        a, b = (np.asarray((run.q, run.v)[i]) for run in runs)
-        assert np.abs(a - b).max() < 1e-9 * max(1.0, np.abs(a).max())
-
-
 def test_the_same_inputs_give_the_same_bits_in_any_lane() -> None:
     model, q, v = CASES["floating_tree"]
     dyn = both(model)["lanes"]
@@ -261,25 +242,6 @@ def test_what_is_saved_changes_no_step(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["lanes", "stages"])
-def test_a_batch_is_its_states_one_by_one(kind: str) -> None:
-    model, *_ = CASES["heavy_top"]
-    dyn = both(model)[kind]
-    q, v = model.random_state(np.random.default_rng(5), 6)
-    rows = np.random.default_rng(6).standard_normal((6, 3, 3))
-    grid = np.array([0.0, 0.1, 0.25, 0.4])
-    many = simulate(dyn, q, v, 0.4, "rk853", rtol=1e-9, save=grid, torque=rows)
-    assert many.q.shape == (6, 4, model.nq)
-    for i in range(6):
-        one = simulate(dyn, q[i], v[i], 0.4, "rk853", rtol=1e-9, save=grid, torque=rows[i])
-        assert np.array_equal(many.q[i], one.q)
-    assert np.array_equal(many.stats.reached, np.full(6, 0.4))
-    with pytest.raises(InputError, match="save: expected a grid"):
-        simulate(dyn, q, v, 0.4, "rk853")
-    none = simulate(dyn, q[:0], v[:0], 0.4, "rk853", save=grid)
-    assert none.q.shape[0] == 0
-
-
-@pytest.mark.parametrize("kind", ["lanes", "stages"])
 def test_held_torques_jump_where_they_should(kind: str) -> None:
     b = mounted("cart", "cart", "x", "prismatic", mass=2.0, axis=(1, 0, 0))
     dyn = both(b.build())[kind]
@@ -302,25 +264,6 @@ def test_parameters_differ_between_lanes() -> None:
             alone = dynamics(catalog.pendulum(length=length), "pinocchio")
             one = simulate(alone, [1.0], [0.0], 2.0, "dop853", rtol=1e-13, save=grid)
             assert np.abs(many.q[i] - one.q).max() < 1e-10
-
-
-@pytest.mark.parametrize("compile_", [True, False])
-def test_a_callable_torque_is_asked_at_the_stages(compile_: bool) -> None:
-    model, q, v = CASES["double_pendulum"]
-    dyn = dynamics(model, "lagrangian", compile=compile_)
-    times = []
-
-    def torque(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        times.append(t)
-        return np.array([np.sin(3 * t), -0.1 * v[0]])
-
-    ours = simulate(dyn, q, v, 1.0, "rk853", rtol=1e-12, save=[1.0], torque=torque)
-    assert min(times) >= 0.0
-    assert max(times) <= 1.0
-    theirs = simulate(dyn, q, v, 1.0, "dop853", rtol=1e-12, save=[1.0], torque=torque)
-    assert np.abs(ours.q - theirs.q).max() < 1e-10
-    batch = simulate(dyn, np.array([q, q]), v, 1.0, "rk853", rtol=1e-12, save=[1.0], torque=torque)
-    assert np.array_equal(batch.q[1], ours.q)
 
 
 # Events
@@ -406,26 +349,6 @@ def test_a_run_that_cannot_go_on_keeps_what_it_has(kind: str) -> None:
     assert batch.stats.reached[0] == batch.stats.reached[2] == 1.0
 
 
-@pytest.mark.parametrize("compile_", [True, False])
-@pytest.mark.parametrize("bad", ["raises", "shape", "nan"])
-def test_a_torque_that_fails_hands_on_what_was_made(bad: str, compile_: bool) -> None:
-    model, q, v = CASES["double_pendulum"]
-
-    def torque(t: float, q: np.ndarray, v: np.ndarray) -> Any:
-        if t < 0.4:
-            return np.zeros(2)
-        if bad == "raises":
-            raise ValueError("out of range")
-        return np.zeros(3) if bad == "shape" else np.full(2, np.nan)
-
-    with pytest.raises(TorqueError) as caught:
-        simulate(dynamics(model, "lagrangian", compile=compile_), q, v, 1.0, "rk853", torque=torque)
-    partial = caught.value.trajectory
-    assert partial.stats.ended == "function_failed"
-    assert 0.0 < partial.t[-1] < 0.4
-    assert np.isfinite(partial.q).all()
-
-
 def test_interruptions_and_progress_get_through() -> None:
     model, q, v = CASES["double_pendulum"]
 
@@ -440,38 +363,11 @@ def test_interruptions_and_progress_get_through() -> None:
         assert told[-1] == 1.0
 
 
-def test_bad_input_is_named() -> None:
-    model, q, v = CASES["double_pendulum"]
-    dyn = dynamics(model)
-    with pytest.raises(InputError, match="rtol: expected at least"):
-        simulate(dyn, q, v, 1.0, "rk853", rtol=1e-17)
-    with pytest.raises(InputError, match="save: expected a grid"):
-        simulate(dyn, q, v, 1.0, "rk853", save=3)
-    with pytest.raises(InputError, match="torque"):
-        simulate(dyn, q, v, 1.0, "rk853", torque=[1.0, 2.0, 3.0])
-    still = simulate(dyn, q, v, 0.0, "rk853")
-    assert still.t.tolist() == [0.0]
-    assert np.array_equal(still.q, [q])
-
-
 def test_a_model_without_joints_stands_still() -> None:
     b = mounted("stone", "stone", "glue", "fixed", mass=1.0)
     for dyn in (dynamics(b.build(), "pinocchio"), dynamics(b.build(), "lagrangian", compile=True)):
         run = simulate(dyn, [], [], 1.0, "rk853", save=[0.0, 1.0])
         assert run.q.shape == (2, 0)
-
-
-def test_extremes_of_time_and_start() -> None:
-    model = catalog.pendulum()
-    for dyn in both(model).values():
-        rest = simulate(dyn, [0.0], [0.0], 1e6, "rk853", save=[1e6])
-        assert rest.q[-1, 0] == 0.0
-        assert rest.stats.steps < 100
-        short = simulate(dyn, [1.0], [0.0], 1e-300, "rk853")
-        assert short.t[-1] == 1e-300
-        fast = simulate(dyn, [1.0], [1e4], 1e-3, "rk853", rtol=1e-12, save=[1e-3])
-        energy = fast.energy()[0] - simulate(dyn, [1.0], [1e4], 0.0, "rk853").energy()[0]
-        assert abs(energy) < 1e-9 * 5e7
 
 
 @pytest.mark.parametrize("engine", ["pinocchio", "lagrangian"])

@@ -245,16 +245,6 @@ def test_a_process_that_does_not_start_says_its_last_words():
         mb.dynamics(mb.catalog.pendulum(), version)
 
 
-def test_a_fork_has_a_process_of_its_own():
-    dyn = mb.dynamics(mb.catalog.pendulum(), present("mujoco", "4.0.0"))
-    before = dyn.mass_matrix([0.3])
-    child = os.fork()
-    if not child:
-        os._exit(0 if np.array_equal(dyn.mass_matrix([0.3]), before) else 1)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-    assert np.array_equal(dyn.mass_matrix([0.3]), before)
-
-
 def test_a_process_ends_with_its_parent_and_leaves_nothing():
     version = present("mujoco", "4.0.0")
     script_ = (
@@ -461,21 +451,6 @@ def test_versions_are_parameters_of_tests(tmp_path):
     assert "2 passed, 1 skipped" in done.stdout
     assert "test_mass[pendulum-mujoco==4.0.0] PASSED" in done.stdout
     assert "no connection" in done.stdout
-
-
-def test_forces_by_functions_are_added_and_no_own_run_leaves_them_out():
-    b = mb.ModelBuilder("pushed")
-    b.add_body("arm", mass=2.0, com=(0.1, 0.2, 0.3), inertia=(0.3, 0.4, 0.5))
-    b.add_joint("hinge", "revolute", parent="world", child="arm", axis=(0, 1, 0))
-    b.add_frame("tip", body="arm", translation=(0.0, 0.0, 0.5))
-    b.add_force("well", "tip", potential=lambda p: 2 * p[0] ** 2 + p[1] ** 2 + p[0] * p[2])
-    model = b.build()
-    dyn, oracle = mb.dynamics(model, present("mujoco", installed("mujoco"))), mb.dynamics(model, "oracle")
-    for quantity in ("inverse_dynamics", "forward_dynamics"):
-        value, truth = (getattr(d, quantity)([0.4], [0.3], [0.2]) for d in (dyn, oracle))
-        assert value == pytest.approx(truth, rel=1e-12)
-    with pytest.raises(UnsupportedError, match="all of pushed: force 'well'"):
-        dyn.rollout([0.4], [0.3], 1e-3, 2)
 
 
 def test_studies_take_the_engines_that_dynamics_takes():

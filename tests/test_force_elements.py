@@ -111,37 +111,7 @@ def test_every_engine_has_the_same_forces(engine: str, oracle: Any) -> None:
     assert off(dyn.at(t=0.0).passive(Q, V), oracle.passive(Q, V)) > 1e-3
 
 
-@pytest.mark.parametrize("quantity", ["inverse_dynamics", "forward_dynamics"])
-def test_derivatives_are_those_of_the_terms(quantity: str, oracle: Any) -> None:
-    """Central differences of 34 digits, whose error is h² of the third derivative."""
-    last, h = (A if quantity == "inverse_dynamics" else TAU)[0], 1e-9
-    by_q, by_v, _ = getattr(mb.dynamics(MODEL, "lagrangian").at(t=TIME), f"{quantity}_derivatives")(Q[0], V[0], last)
-
-    def slope(move: Any) -> np.ndarray:
-        ends = [oracle.extended(quantity, *move(s), last) for s in (-h, h)]
-        return ((ends[1][0] - ends[0][0]) + (ends[1][1] - ends[0][1])) / (2 * h)
-
-    for k, e in enumerate(np.eye(MODEL.nv)):
-        # The displacement is rounded to double, so half of the digits of h are left.
-        assert off(slope(lambda s, e=e: (Q[0], V[0] + s * e)), by_v[:, k]) < 1e-5
-        assert off(slope(lambda s, e=e: (MODEL.integrate(Q[0], s * e), V[0])), by_q[:, k]) < 1e-5
-
-
 # What they are: against formulas written apart
-
-
-@pytest.mark.parametrize("axes", ["local", "world", "local_world_aligned"])
-@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
-def test_a_force_on_a_frame_is_the_wrench_that_the_function_gives(engine: str, axes: Any) -> None:
-    b = tree()
-    b.add_force("push", "tip", force=push, moment=(1.0, 2.0, 3.0), axes=axes)
-    model = b.build()
-    dyn, bare = mb.dynamics(model, engine).at(t=TIME), mb.dynamics(model.without("forces"), engine)
-    for q, v in zip(Q, V, strict=True):
-        p, twist = bare.pose(q, "tip")[:3, 3], bare.velocity(q, v, "tip", axes)
-        wrench = np.concatenate([push(TIME, p, twist), [1.0, 2.0, 3.0]])
-        expected = bare.generalized_force(q, {"tip": wrench}, axes)
-        assert off(dyn.passive(q, v) - bare.passive(q, v), expected) < 1e-13
 
 
 def displacement(dyn: mb.Dynamics, q: np.ndarray) -> np.ndarray:

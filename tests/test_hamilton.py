@@ -268,8 +268,3 @@ def test_pickled_and_batched():
     p = h.to_momentum(q, v)
     assert np.array_equal(p[2], h.to_momentum(q[2], v[2]))
     assert np.array_equal(pickle.loads(pickle.dumps(h)).to_momentum(q, v), p)
-
-
-def test_a_taken_name_is_left_alone():
-    own = Lagrangian(m * w**2 / 2 + p_theta * theta**2, 0, [theta], parameters=[m, p_theta]).hamiltonian()
-    assert own.momenta == (sp.Symbol("P_theta"),)

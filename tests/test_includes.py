@@ -6,7 +6,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import mujoco
-import numpy as np
 import pytest
 
 import mbkit as mb
@@ -59,29 +58,6 @@ def split(tmp_path: Path) -> Path:
         parts__forearm=inside("\n\n" + FOREARM.format(include("more\\hand.xml"))),
         parts__more__hand=inside(HAND),
     )
-
-
-def test_a_robot_over_several_files_is_the_same_as_in_one(split: Path) -> None:
-    model = mb.load(split)
-    whole = f'<mujoco model="arm">{HEAD}{DEFAULTS}{ASSETS}<worldbody>{UPPER.format(FOREARM.format(HAND))}</worldbody></mujoco>'
-    assert model == mb.load(files(split.parent / "one", main=whole))
-    assert "included: common/settings.xml, common/assets.xml, parts/forearm.xml, parts/more/hand.xml" in model.notes
-    hand = split.parent / "parts" / "more" / "hand.xml"
-    hand.write_text(inside(HAND.replace("0.04", "0.05")), encoding="utf-8")
-    assert mb.load(split).digest != model.digest
-    hand.write_text(inside(HAND), encoding="utf-8")
-    # Read by MuJoCo itself, from the files.
-    m = mujoco.MjModel.from_xml_path(str(split))
-    d = mujoco.MjData(m)
-    dyn = mb.dynamics(model, "pinocchio")
-    rng = np.random.default_rng(1)
-    for _ in range(3):
-        d.qpos[:], d.qvel[:] = rng.standard_normal((2, 3))
-        mujoco.mj_forward(m, d)
-        M = np.zeros((3, 3))
-        mujoco.mj_fullM(m, d, M)
-        assert np.abs(dyn.mass_matrix(d.qpos) - M).max() < 1e-14
-        assert np.abs(dyn.nle(d.qpos, d.qvel) - d.qfrc_bias).max() < 1e-13
 
 
 def test_importers_are_given_what_is_included(split: Path) -> None:

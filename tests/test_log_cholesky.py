@@ -23,7 +23,7 @@ def matrix(inertia: dict[tuple[int, int], float]) -> np.ndarray:
     return I
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(NUMBERS)
 def test_any_ten_numbers_are_a_cloud_of_points(ten):
     """U's columns are points: J = U Uᵀ sums a point of weight w² at (x, y, z) = column / w."""

@@ -11,7 +11,7 @@ import pytest
 
 import mbkit as mb
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import InputError, NumericalError, UnsupportedError
+from mbkit.errors import NumericalError, UnsupportedError
 from mbkit.model.loops import LOOP_KINDS
 from mbkit.model.parts import Prescribed
 from tests.quantities import MODELS, condition
@@ -202,17 +202,3 @@ def test_batches_copies_and_wrenches(four_bar):
             assert off(x.constraint_residual(q), exact.at(t=t).constraint_residual(q)) < 1e-14
         assert off(*(x.forward_dynamics(q, v, tau) for x in (later, exact.at(t=t)))) < 1e-11
     assert dyn.model.time == 0.0
-
-
-def test_what_would_be_false_with_loops_is_refused(four_bar):
-    model, dyn, q, v = four_bar
-    with pytest.raises(InputError, match="forces in its loops"):
-        dyn.joint_wrenches(q, v, v)
-    assert {"joint_wrenches", "newton_euler_residual", "loop_wrenches", "constraint_forces"} <= dyn.supports
-    tree = mb.dynamics(model.without("loops"))
-    assert "joint_wrenches" in tree.supports
-    assert not tree.supports & {"constraint_forces", "loop_wrenches", "actuator_forces"}
-    # A term of the tree, whatever closes it.
-    assert np.array_equal(dyn.inverse_dynamics(q, v, v), tree.inverse_dynamics(q, v, v))
-    with pytest.raises(UnsupportedError, match="no loops"):
-        tree.constraint_solver  # noqa: B018  # raises

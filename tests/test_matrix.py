@@ -565,16 +565,6 @@ def test_every_kind_has_an_example_and_every_path_a_check() -> None:
     assert set(TYPES) == {f"joint_type.{x}" for x, type_ in JOINT_TYPES.items() if type_.built_in} | {"joint_type.beam"}
 
 
-@pytest.mark.parametrize("name", EXAMPLES | TYPES)
-def test_an_example_moves_as_in_numpy(name: str) -> None:
-    x = kind_examples.example(name)
-    dyn = mb.dynamics(x.model, "lagrangian", compile=False)
-    dyn = dyn.at(**{x.model.time_parameter: x.t}) if x.model.time_parameter else dyn
-    assert_close(dyn.forward_dynamics(x.q, x.v, x.tau), x.accelerated())
-    assert_close(dyn.mass_matrix(x.q), x.mass_matrix(x.plain.q))
-    assert_close(np.array(dyn.potential_energy(x.q)), np.array(x.plain.potential(x.plain.q)))
-
-
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_a_kind_acts_alone_and_is_taken_out(name: str) -> None:
     model = example(name)

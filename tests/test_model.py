@@ -103,7 +103,7 @@ def built_or_refused(wrong):
 
 
 @given(wrong=st.dictionaries(st.sampled_from(PLACES), st.sampled_from(HOSTILE), min_size=2, max_size=3))
-@settings(max_examples=150)
+@settings(max_examples=60)
 def test_whatever_a_builder_is_given_is_built_or_refused_by_name(wrong):
     built_or_refused(wrong)
 

@@ -17,7 +17,7 @@ from mbkit.errors import MbkitWarning
 from mbkit.model import Model
 from mbkit.simulate import METHODS, simulate
 from tests import orders
-from tests.scenes import chain, damped_arm, slider
+from tests.scenes import damped_arm, slider
 
 NATIVE = tuple(m.name for m in METHODS.values() if m.kind == "native" and "mujoco" in m.engines)
 IMPLICIT = ("mujoco_implicit", "mujoco_implicitfast", "mujoco_discrete")
@@ -47,27 +47,6 @@ def test_observed_order(case: str, method: str) -> None:
     counts = (60, 90, 140, 200) if METHODS[method].order == 4 else (300, 450, 700, 1000)
     order = orders.observed(cases()[case], method, counts, "mujoco")
     assert order == pytest.approx(METHODS[method].order, abs=0.2)
-
-
-@pytest.mark.thorough("mujoco_rk4-rk4")
-@pytest.mark.parametrize(("native", "own"), [("mujoco_euler", "semi_implicit_euler"), ("mujoco_rk4", "rk4")])
-def test_a_tumbling_base_runs_as_with_the_own_method(native: str, own: str) -> None:
-    """The same model, step and formula in the limit of small steps: q and v, all along, for one state and a batch."""
-    base = {"kind": "free", "mass": 2.0, "com": (0.1, -0.2, 0.05), "inertia": (0.3, 0.4, 0.6), "rpy": (0.3, -0.2, 1.0)}
-    arm = {"kind": "ball", "mass": 0.7, "com": (0.2, 0.1, 0.0), "inertia": (0.02, 0.03, 0.04), "damping": 0.1}
-    model = chain(base | {"translation": (0, 0, 1)}, arm | {"translation": (0.3, 0.0, 0.1)}).build()
-    q, v = model.random_state(np.random.default_rng(4), 2)
-    v[:, :6] += [1.0, 2.0, -1.5, 2.0, -1.0, 3.0]
-    order, apart = METHODS[native].order, []
-    for n in (100, 200):
-        runs = [simulate(dynamics(model, "mujoco"), q, v, 0.2, method, dt=0.2 / n) for method in (native, own)]
-        alone = simulate(dynamics(model, "mujoco"), q[0], v[0], 0.2, native, dt=0.2 / n)
-        assert np.array_equal(alone.q, runs[0].q[0])
-        assert np.array_equal(alone.v, runs[0].v[0])
-        apart.append([np.abs(runs[0].q - runs[1].q).max(), np.abs(runs[0].v - runs[1].v).max()])
-    coarse, fine = np.array(apart)
-    assert np.all(fine < 1e-7 if order == 4 else fine < 0.05)
-    assert np.all(fine < 0.6 * coarse + 1e-12)
 
 
 def gain(method: str, model: Model, v: np.ndarray) -> float:

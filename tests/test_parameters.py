@@ -466,7 +466,7 @@ class Magnitude(float):
         return Magnitude(float(self) ** exponent)
 
 
-@settings(max_examples=100)
+@settings(max_examples=40)
 @given(st.recursive(LEAVES, _grown, max_leaves=8))
 def test_expressions_are_what_floats_would_be(x):
     if not isinstance(x, Expression):

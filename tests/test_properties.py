@@ -260,7 +260,7 @@ def every_kind() -> Derived:
     near=st.sampled_from((0.0, 1e-16, 1e-12, 1e-8, 1e-4, 1.0)),
     seed=st.integers(0, 2**32 - 1),
 )
-@settings(max_examples=200)
+@settings(max_examples=60)
 def test_the_structure_holds_at_extremes(speed, corner, near, seed):
     """At rest, at any speed, and near the poses where Euler angles and hinges line up."""
     derived = every_kind()
@@ -274,7 +274,7 @@ def test_the_structure_holds_at_extremes(speed, corner, near, seed):
 
 
 @given(power=st.integers(-100, 100), seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=50)
+@settings(max_examples=20)
 def test_coriolis_forces_are_quadratic_to_the_last_bit(power, seed):
     """Scaling by powers of two rounds nothing, so that a stray term cannot hide."""
     derived = every_kind()

@@ -8,7 +8,6 @@ import mpmath
 import numpy as np
 import pytest
 
-from mbkit import dynamics
 from validation import closed_forms, elliptic
 from validation import published as checks
 from validation.closed_forms import published
@@ -166,16 +165,6 @@ def turning(spin: elliptic.Spin, h: float) -> np.ndarray:
 
 
 # Scenes
-
-
-def test_scenes_are_ten_and_valid() -> None:
-    assert len({scene.name for scene in SCENES}) == len(SCENES) == 10
-    for scene in SCENES:
-        model = scene.model()
-        model.check_q(np.array(scene.q0))
-        model.check_v(np.array(scene.v0))
-        assert scene.duration > 0
-        assert np.isfinite(dynamics(model).forward_dynamics(scene.q0, scene.v0, np.zeros(model.nv))).all()
 
 
 @pytest.mark.thorough("spherical_pendulum", "heavy_top")

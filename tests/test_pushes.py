@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import warnings
 from typing import Any
 
 import numpy as np
@@ -26,12 +25,6 @@ WRENCH = np.array([3.0, -1.0, 2.0, 0.4, 0.3, -0.2])
 def brick(gravity: Any = (0, 0, 0)) -> Model:
     b = mounted("brick", "brick", "float", "free", gravity=gravity, mass=2.0, inertia=(0.1, 0.2, 0.3))
     b.add_frame("corner", body="brick", translation=(0.3, 0.0, 0.1), rpy=(0.2, -0.3, 0.5))
-    return b.build()
-
-
-def damped() -> Model:
-    b = mounted("damped", "rod", "hinge", "revolute", mass=2.0, com=(0.5, 0, 0), axis=(0, 1, 0), damping=0.3)
-    b.add_frame("tip", body="rod", translation=(1.0, 0, 0))
     return b.build()
 
 
@@ -108,33 +101,6 @@ def test_what_is_held_is_the_wrench_and_not_its_generalized_force() -> None:
 
 
 # Engines and methods
-
-
-@pytest.mark.parametrize(
-    ("robot", "floating", "wrenches", "axes"),
-    [
-        ("panda", False, {"panda_hand": WRENCH, "panda_link4": -WRENCH}, "local"),
-        ("anymal", True, {"base": 40 * WRENCH, "LF_FOOT": WRENCH}, "world"),
-    ],
-)
-def test_engines_agree_on_robots(robot: str, floating: bool, wrenches: Any, axes: str) -> None:
-    model = mb.load(robot, floating_base=floating, mimic="free")
-    q, v = model.random_state(np.random.default_rng(0))
-    given: dict[str, Any] = {"dt": 0.01, "wrenches": wrenches, "wrench_axes": axes, "doubt": False}
-    reference = mb.simulate(mb.dynamics(model, "lagrangian", compile=False), q, v, 0.1, **given)
-    # The machine code of a step of the larger one takes seconds to compile.
-    for engine in ENGINES[floating:]:
-        close(mb.simulate(mb.dynamics(model, engine), q, v, 0.1, **given), reference)
-
-
-@pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
-def test_a_wrench_on_a_closed_loop_is_its_generalized_force(engine: str) -> None:
-    dyn, own = (mb.dynamics(mb.catalog.slider_crank(), x) for x in (engine, "lagrangian"))
-    q, v = own.project([0.5, -0.2, -0.1], [1.0, 0.0, 0.0])
-    pushed = mb.simulate(dyn, q, v, 0.05, dt=1e-3, wrenches={"rod": WRENCH}, wrench_axes="world")
-    force = lambda _, q, __: own.jacobian(q, "rod", "world").T @ WRENCH  # noqa: E731
-    close(pushed, mb.simulate(dyn, q, v, 0.05, dt=1e-3, torque=force))
-    assert np.abs(pushed.power_balance()).max() < 1e-10
 
 
 @pytest.fixture(scope="module")
@@ -226,16 +192,6 @@ def test_a_batch_is_its_trajectories(own: Dynamics, start: Any) -> None:
     np.testing.assert_array_equal(runs[0].q, runs[1].q)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_function_that_is_constant_is_the_constant(engine: str, own: Dynamics, start: Any) -> None:
-    dyn = mb.dynamics(own.model, engine)
-    frame, given = tip(own.model), (start[0][:2], start[1][:2], 0.02)
-    held = mb.simulate(dyn, *given, dt=0.01, wrenches={frame: WRENCH, own.model.bodies[0].name: -WRENCH})
-    function = mb.simulate(dyn, *given, dt=0.01, wrenches={frame: lambda *_: WRENCH, own.model.bodies[0].name: -WRENCH})
-    close(function, held, 1e-13)
-    np.testing.assert_array_equal(function.wrenches()[frame], held.wrenches()[frame])
-
-
 def test_named_parameters_may_differ_beside_wrenches() -> None:
     model = mb.catalog.pendulum(mass=mb.Parameter("m"), length=0.7)
     dyn = mb.dynamics(model, "lagrangian").at(m=[1.0, 2.0, 3.0])
@@ -299,40 +255,6 @@ def test_functions_do_work_too_and_survive_a_pickle() -> None:
     assert run.tau.shape == run.v.shape
 
 
-def test_a_pushed_run_raises_no_doubts_of_its_energy() -> None:
-    model = brick()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        run = mb.simulate(
-            mb.dynamics(model, "pinocchio"), model.neutral(), np.zeros(6), 0.2, wrenches={"corner": WRENCH}
-        )
-    assert run.check().passed
-    assert run.energy()[-1] > 0.1
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_what_pushes_nothing_does_no_work(engine: str) -> None:
-    model = damped()
-    dyn = mb.dynamics(model, engine)
-    free = mb.simulate(dyn, [1.0], [0.0], 0.1, dt=0.01)
-    for wrenches in ({"tip": np.zeros(6)}, {"world": WRENCH}, {}):
-        run = mb.simulate(dyn, [1.0], [0.0], 0.1, dt=0.01, wrenches=wrenches)
-        np.testing.assert_allclose(run.q, free.q, rtol=0, atol=10 * EPS)
-        np.testing.assert_allclose(run.work(), free.work(), rtol=0, atol=10 * EPS)
-        assert set(run.wrenches()) == set(wrenches)
-
-
-def test_a_batch_of_none_and_a_model_without_velocities() -> None:
-    model = damped()
-    given: dict[str, Any] = {"dt": 0.01, "wrenches": {"tip": np.empty((0, 6))}}
-    run = mb.simulate(mb.dynamics(model), np.empty((0, 1)), np.empty((0, 1)), 0.1, **given)
-    assert run.work().shape == (0, 11)
-    b = mounted("welded", "block", "weld", "fixed", mass=1.0, inertia=(1, 1, 1))
-    for engine in ENGINES:
-        run = mb.simulate(mb.dynamics(b.build(), engine), [], [], 0.02, dt=0.01, wrenches={"block": WRENCH})
-        assert not run.work().any()
-
-
 def test_functions_stand_beside_samples() -> None:
     model = arm()
     q, v = model.random_state(np.random.default_rng(0))
@@ -392,15 +314,6 @@ def test_rows_for_trajectories_or_steps_must_be_told_apart() -> None:
         mb.simulate(dyn, q, np.zeros(6), 0.02, dt=0.01, wrenches={"brick": np.zeros((2, 6))})
     with pytest.raises(InputError, match="needs save="):
         mb.simulate(dyn, q[0], np.zeros(6), 0.02, "rk853", wrenches={"brick": np.zeros((2, 6))})
-
-
-def test_bad_wrenches_of_steps() -> None:
-    dyn, state = mb.dynamics(brick(), "lagrangian"), (brick().neutral(), np.zeros(6), np.zeros(6), 0.01)
-    for wrenches, error in (({"x": WRENCH}, UnknownNameError), ({"brick": [1.0]}, InputError), ([1], InputError)):
-        with pytest.raises(error):
-            dyn.step(*state, wrenches=wrenches)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="different sizes"):
-        dyn.step(np.tile(state[0], (2, 1)), *state[1:], wrenches={"brick": np.zeros((3, 6))})
 
 
 def test_systems_without_frames_refuse() -> None:

@@ -439,27 +439,6 @@ def test_a_description_carries_it_everywhere() -> None:
 # Refusals and faults
 
 
-@pytest.mark.parametrize("engine", ["mujoco", "drake"])
-def test_engines_without_such_rows_refuse_them_by_name(engine: str) -> None:
-    model = mb.catalog.rolling_disc()
-    q, v = model.random_state(0)
-    with pytest.raises(UnsupportedError, match=r"rolling_disc.*'floor'") as error:
-        # Drake has the terms of its tree.
-        mb.dynamics(model, engine).forward_dynamics(q, v, np.zeros(model.nv))
-    assert "lagrangian" in str(error.value) or "not installed" in str(error.value)
-
-
-def test_writers_and_paper_refuse_them_by_name() -> None:
-    model = mb.catalog.rolling_disc()
-    for call in (
-        lambda: mb.convert(model, "mjcf"),
-        lambda: mb.convert(model, "urdf"),
-        lambda: model.base_parameters(),
-    ):
-        with pytest.raises(UnsupportedError, match=r"no.slip"):
-            call()
-
-
 def test_loads_and_reduced_inertia_do_not_leave_contact_forces_out_in_silence() -> None:
     model = mb.catalog.bicycle()
     still = np.zeros(9)
@@ -469,17 +448,6 @@ def test_loads_and_reduced_inertia_do_not_leave_contact_forces_out_in_silence() 
             dyn.joint_wrenches(still, still, still, tau=still)
         with pytest.raises(UnsupportedError, match=r"holds velocities.*consistent_changes"):
             dyn.reduced_inertia(still, "lean")
-
-
-def test_wheels_carry_the_weight() -> None:
-    """At rest and upright, by the levers of the masses about both contacts."""
-    model = mb.catalog.bicycle()
-    dyn = mb.dynamics(model, "pinocchio")
-    forces = dyn.constraint_forces(np.zeros(9), np.zeros(9), np.zeros(9))
-    moment = 0.3 * 85 + 0.9 * 4 + 1.02 * 3
-    # It begins to fall about its wheels, straight to one side: the normal forces are those of rest.
-    assert forces[1] == pytest.approx(9.81 * moment / 1.02, rel=1e-12)
-    assert forces[0] + forces[1] == pytest.approx(9.81 * 94, rel=1e-12)
 
 
 def test_every_fault_is_in_the_one_error() -> None:

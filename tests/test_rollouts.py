@@ -4,9 +4,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import pickle
-import warnings
 from typing import Any
 
 import casadi as ca
@@ -22,7 +19,7 @@ from mbkit.derivation.steps.collocation import Collocation
 from mbkit.derivation.steps.fixed import march, march_in_stages, velocity_changes
 from mbkit.engines import compiled_calls, dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import MbkitWarning, UnknownNameError
+from mbkit.errors import MbkitWarning
 from mbkit.methods.registry import method_of
 from mbkit.methods.tableaus import ImplicitTableau
 from mbkit.model import Model, ModelBuilder
@@ -188,11 +185,6 @@ def test_a_step_can_be_differentiated_at_rest() -> None:
         assert J[:, model.nq + model.nv - 2] == pytest.approx((ends[0] - ends[1]) / 2e-6, abs=1e-8)
 
 
-def test_steps_name_their_methods() -> None:
-    with pytest.raises(UnknownNameError, match="rk4"):
-        step(Equations(catalog.pendulum()), "rk5")
-
-
 # Rollouts
 
 
@@ -213,15 +205,6 @@ def test_rollouts_in_stages_are_the_stepwise_runs(method: str, floating: Lagrang
     run = simulate(floating, q, v, 0.05, method, torque=tau)
     assert_same(run, stepwise(floating, q, v, 0.05, method, torque=tau))
     assert len(floating._step_plan(method).parts) > 1
-
-
-def test_robots_are_mujocos_rollouts() -> None:
-    model = mb.load("ur5").without("damping")
-    q, v = model.random_state(np.random.default_rng(5), 5)
-    run = simulate(dynamics(model, "lagrangian", compile=True), q, 0.1 * v, 0.2)
-    own = simulate(dynamics(model, "mujoco"), q, 0.1 * v, 0.2, "mujoco_rk4")
-    assert np.abs(run.q - own.q).max() < 1e-11
-    assert np.abs(run.v - own.v).max() < 1e-11
 
 
 def test_torques_of_every_shape_are_held(planar: LagrangianDynamics) -> None:
@@ -333,39 +316,6 @@ def test_a_block_of_implicit_steps_stops_anywhere(method: str, planar: Lagrangia
             np.testing.assert_allclose(chunk.now(name), carried[name][:, k + 1].T, rtol=1e-12, atol=1e-13)
 
 
-# What the method promises
-
-
-@pytest.mark.parametrize(("method", "order"), [("rk4", 4), ("semi_implicit_euler", 1)])
-def test_order_of_convergence_and_of_energy(method: str, order: int, floating: LagrangianDynamics) -> None:
-    q, v = start(floating, 4, seed=2)
-    fine = simulate(floating, q, v, 0.4, "rk4", dt=2.5e-4, save=[0.4])
-    steps = [2e-2, 1e-2, 5e-3] if method == "rk4" else [4e-4, 2e-4, 1e-4]
-    errors, drift = [], []
-    for dt in steps:
-        run = simulate(floating, q, v, 0.4, method, dt=dt, save=[0.0, 0.4])
-        errors.append(np.linalg.norm(floating.model.difference(run.q[:, -1], fine.q[:, -1])))
-        drift.append(np.abs(np.diff(run.energy())).max())
-    slopes = [np.polyfit(np.log(steps), np.log(x), 1)[0] for x in (errors, drift)]
-    assert slopes[0] == pytest.approx(order, abs=0.25)
-    assert slopes[1] > order - 0.35
-
-
-def test_quaternions_stay_of_unit_length(floating: LagrangianDynamics) -> None:
-    q, v = start(floating, 3)
-    run = simulate(floating, q, 4 * v, 1.0, dt=5e-3, save=10)
-    for first, _ in floating.model.quaternions:
-        assert np.abs(np.linalg.norm(run.q[..., first : first + 4], axis=-1) - 1).max() < 8 * EPS
-
-
-def test_a_body_without_forces_keeps_its_velocity_to_the_bit() -> None:
-    dyn = dynamics(catalog.free_body().without("gravity"), "lagrangian", compile=True)
-    q, v = dyn.model.random_state(np.random.default_rng(0), 4)
-    run = simulate(dyn, q, v, 0.5)
-    world = Space(dyn.model).to_integrator_velocity(run.q.reshape(-1, 7), run.v.reshape(-1, 6))[:, :3].reshape(4, -1, 3)
-    assert np.abs(world - world[:, :1]).max() < 32 * EPS * np.abs(world).max()
-
-
 # Runs that go wrong
 
 
@@ -450,12 +400,6 @@ def test_an_error_in_the_callers_function_stops_the_threads(
             simulate(dyn, q, v, 1e3, save=[0.0], progress=stop)
 
 
-def test_callables_keep_to_the_stepwise_path(planar: LagrangianDynamics) -> None:
-    q, v = start(planar)
-    run = simulate(planar, q, v, 0.05, torque=lambda t, q, v: -v)
-    assert_same(run, stepwise(planar, q, v, 0.05, torque=lambda t, q, v: -v))
-
-
 def test_parameters_are_the_trajectorys_own() -> None:
     model = catalog.pendulum(mass=mb.Parameter("m", 2.0), length=mb.Parameter("l", 1.0))
     dyn = dynamics(model, "lagrangian", compile=True)
@@ -468,24 +412,3 @@ def test_parameters_are_the_trajectorys_own() -> None:
             one = simulate(plain, [1.0], [0.0], 0.3, **options)
             assert run.q[i] == pytest.approx(one.q, abs=1e-12)
             assert run.energy()[i] == pytest.approx(one.energy(), abs=1e-11)
-
-
-def in_a_child(dyn: LagrangianDynamics, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return simulate(dyn, q, v, 0.02).q
-
-
-@pytest.mark.thorough("spawn")
-@pytest.mark.parametrize("way", ["fork", "spawn"])
-def test_other_processes_find_the_same(way: str, planar: LagrangianDynamics) -> None:
-    if way not in multiprocessing.get_all_start_methods():
-        pytest.skip(f"no {way} on this system")
-    q, v = start(planar, 20)
-    here = simulate(planar, q, v, 0.02)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        with multiprocessing.get_context(way).Pool(1) as pool:
-            assert np.array_equal(pool.apply(in_a_child, (planar, q, v)), here.q)
-    again = pickle.loads(pickle.dumps(here))
-    assert np.array_equal(again.q, here.q)
-    assert not again.q.flags.writeable
-    assert again.q.base is None

@@ -278,18 +278,6 @@ def test_rollouts_of_every_rotation_and_with_dampers_and_springs_are_mujocos() -
     assert_as_mujoco(damped_arm(), np.array([1.0, -0.5]), np.array([2.0, 1.0]))
 
 
-@pytest.mark.thorough("ur5-options0", "anymal_b-options2")
-@pytest.mark.parametrize(
-    ("robot", "options"),
-    [("ur5", {}), ("panda", {"mimic": "free"}), ("anymal_b", {"floating_base": True})],
-)
-def test_rollouts_of_robots_are_mujocos(robot: str, options: dict[str, Any]) -> None:
-    model = mb.load(robot, **options).without("damping")
-    # Errors grow along a motion: from faster starts the Panda multiplies rounding by 1e4 within 1 s.
-    q, v = model.random_state(np.random.default_rng(5))
-    assert_as_mujoco(model, q, 0.1 * v)
-
-
 def test_native_batches_torques_and_implicit_methods() -> None:
     model = catalog.double_pendulum()
     dyn = dynamics(model, "mujoco")
@@ -343,43 +331,7 @@ def test_nothing_is_loaded_that_a_run_does_not_need(engine: str, method: str) ->
     assert made.stdout == f"[{engine!r}]\n", made.stderr
 
 
-# Conservation; published figures are reached in tests/test_published.py
-
-
-def test_energy_and_momentum_are_kept() -> None:
-    model = catalog.double_pendulum()
-    run = simulate(dynamics(model), [2.0, 0.5], [0.0, 0.0], 5.0, dt=1e-3)
-    energy = run.energy()
-    assert energy.shape == run.t.shape
-    scale = 2 * 9.81
-    assert np.ptp(energy) < 1e-7 * scale
-    # On a separable system semi-implicit Euler is symplectic: an error, but no drift. Explicit Euler would drift.
-    loose = simulate(dynamics(catalog.pendulum()), [2.0], [0.0], 20.0, "semi_implicit_euler", dt=2e-3).energy()
-    assert 1e-3 < np.ptp(loose[:5000]) < 1e-1
-    assert np.ptp(loose[-5000:]) == pytest.approx(np.ptp(loose[:5000]), rel=0.02)
-
-    box = catalog.free_body()
-    q, v = box.neutral(), np.array([1.0, 2.0, 3.0, 0.1, 5.0, 0.1])
-    flight = simulate(dynamics(box), q, v, 2.0)
-    world = Space(box).to_integrator_velocity(flight.q, flight.v)
-    assert np.abs(world[:, :3] - v[:3]).max() < 1e-12
-    assert flight.q[-1, :3] == pytest.approx(2 * v[:3], abs=1e-12)
-
-
 # DOP853
-
-
-def test_dop853_and_rk4_come_to_the_same_by_different_roads() -> None:
-    model, q, v = tumbling()
-    dyn = dynamics(model)
-    run = simulate(dyn, q, v, 0.3, "dop853", rtol=1e-13)
-    fine = simulate(dyn, q, v, 0.3, "rk4", dt=2e-4)
-    assert run.t[0] == 0
-    assert run.t[-1] == 0.3
-    assert run.stats.steps == len(run.t) - 1
-    assert run.stats.evaluations >= 12 * run.stats.steps
-    assert np.abs(model.difference(fine.q[-1], run.q[-1])).max() < 1e-9
-    model.check_q(run.q)
 
 
 def test_dop853_tolerance_rules_the_error() -> None:

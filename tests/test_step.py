@@ -20,7 +20,7 @@ from mbkit.errors import InputError, NumericalError, UnknownNameError, Unsupport
 from mbkit.lagrangian import systems
 from mbkit.model import Model
 from mbkit.simulate import METHODS, Tableau, register_method, simulate
-from tests.random_trees import ALL, SOUND, random_tree
+from tests.random_trees import ALL, random_tree
 from tests.scenes import mounted
 from tests.test_rollouts import tumbling, unstable
 
@@ -103,19 +103,6 @@ def test_stage_by_stage_it_has_the_bits_of_simulate_on_any_engine(engine: str, m
     assert_simulated(mb.dynamics(model, engine, **options), method)
 
 
-def test_engines_agree() -> None:
-    model = random_tree(7, n=4, kinds=SOUND)
-    q, v, tau = states(model, 3)
-    a, b = (dyn.step(q, v, tau, H) for dyn in (own(model), mb.dynamics(model, "pinocchio")))
-    assert_equal(a, b, rounding=True)
-
-
-@pytest.mark.thorough("panda")
-@pytest.mark.parametrize("name", ["panda", "ur5"])
-def test_robots_with_and_without_a_mimic_joint(name: str) -> None:
-    assert_simulated(own(mb.load(name)), "rk4")
-
-
 @pytest.fixture
 def heun() -> Iterator[str]:
     register_method(Tableau("heun", [[0, 0], [1, 0]], [0.5, 0.5], order=2))
@@ -150,14 +137,6 @@ def test_parameters_of_one_state_and_of_each() -> None:
     assert_equal(each.step(q[0], v[0], tau[0], H), each.step(q[[0] * 4], v[[0] * 4], tau[[0] * 4], H))
     with pytest.raises(InputError, match="a batch of 3, but the parameters' values are 4"):
         each.step(q[:3], v[:3], tau[:3], H)
-
-
-def test_one_state_beside_a_batch_is_repeated_and_an_empty_batch_stays_empty() -> None:
-    dyn = own(mb.load("ur5"))
-    q, v, tau = states(dyn.model, 4)
-    assert_equal(dyn.step(q, v[0], tau[0], H), dyn.step(q, v[[0] * 4], tau[[0] * 4], H))
-    for one in (dyn, mb.dynamics(dyn.model, "pinocchio"), own(dyn.model, compiled=False)):
-        assert [x.shape for x in one.step(q[:0], v[:0], tau[:0], H)] == [(0, 6), (0, 6)]
 
 
 @pytest.mark.parametrize("compiled", [True, False])

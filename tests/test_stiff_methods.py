@@ -1,5 +1,5 @@
 # Torques have the signature they are called with.
-# ruff: noqa: ARG001, ARG002, ARG005
+# ruff: noqa: ARG002, ARG005
 """Radau, BDF and LSODA: the exact Jacobian, stiff scenes, and runs that go wrong."""
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import pytest
 import mbkit as mb
 from mbkit import catalog
 from mbkit.engines import Dynamics, dynamics
-from mbkit.errors import MbkitWarning, NumericalError, TorqueError
+from mbkit.errors import MbkitWarning, NumericalError
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import simulate
 from mbkit.simulate.diagnostics.stiffness import RateJacobian
@@ -111,13 +111,6 @@ def test_the_jacobian_has_the_parameters_values() -> None:
     assert many(0.0, y, tau) == pytest.approx(plain, abs=1e-12)
 
 
-def test_another_engine_is_derived_once() -> None:
-    dyn = dynamics(catalog.pendulum())
-    assert RateJacobian(dyn)._twin is RateJacobian(dyn)._twin
-    own = dynamics(catalog.pendulum(), "lagrangian")
-    assert RateJacobian(own)._twin is own
-
-
 def test_where_there_is_no_jacobian_the_last_one_stays() -> None:
     model = catalog.pendulum()
     exact = RateJacobian(dynamics(model, "lagrangian"))
@@ -166,17 +159,6 @@ def test_every_joint_kind_moves_as_with_dop853(method: str, every_kind: tuple[An
     assert run.stats.jacobians > 0 or method == "lsoda"
 
 
-@pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
-@pytest.mark.parametrize("method", IMPLICIT)
-def test_scipys_run_on_every_engine(engine: str, method: str) -> None:
-    model = catalog.heavy_top()
-    q, v = model.neutral(), np.array([1.0, 20.0, -4.0])
-    truth = simulate(dynamics(model, "lagrangian"), q, v, 0.1, "dop853", rtol=1e-12)
-    run = simulate(dynamics(model, engine), q, v, 0.1, method, rtol=ENOUGH[method])
-    assert apart(model, run, truth) < 1e-5
-    assert len(run.t) == run.stats.steps + 1
-
-
 @pytest.mark.thorough("radau")
 @pytest.mark.parametrize("method", SCIPY)
 def test_a_dense_grid_costs_little_and_loses_nothing(method: str) -> None:
@@ -212,19 +194,6 @@ def test_stiff_scenes_are_reached_with_few_evaluations(scene: Any, stiffness: fl
         assert apart(model, run, truth) < 1e-6, method
         assert run.stats.evaluations < 1000, method
         assert 0 < run.stats.jacobians < 100, method
-
-
-@pytest.mark.thorough
-def test_an_explicit_method_needs_far_more() -> None:
-    model = elastic_pendulum(1e6, 1e4)
-    dyn = dynamics(model, "lagrangian")
-    explicit, implicit = (
-        simulate(dyn, [1.0, 0.0], [0.0, 0.0], 1.0, method, rtol=1e-7, save=[0, 1.0]) for method in ("dop853", "radau")
-    )
-    assert apart(model, explicit, implicit) < 1e-6
-    # The fast decay, at the rate c/m = 1e4 and more per second, bounds its step, whatever the tolerance.
-    assert explicit.stats.evaluations > 20 * implicit.stats.evaluations
-    assert explicit.stats.rejected > 0
 
 
 def test_a_stiff_linear_oscillator_follows_its_closed_form() -> None:
@@ -277,19 +246,6 @@ def test_parameters_of_each_of_a_batch(method: str) -> None:
         assert q[:, 0] == pytest.approx(exact, abs=1e-7)
     one = simulate(dyn.at(l=2.0), [1.0], [0.0], 1.0, method, rtol=ENOUGH[method], save=times)
     assert one.q == pytest.approx(run.q[1], abs=1e-12)
-
-
-@pytest.mark.parametrize("method", IMPLICIT)
-def test_the_same_inputs_give_the_same_bits_and_a_batch_may_be_empty(method: str) -> None:
-    model = catalog.heavy_top()
-    dyn, save = dynamics(model, "lagrangian"), np.linspace(0, 0.2, 21)
-    v = np.array([1.0, 20.0, -4.0])
-    runs = [simulate(dyn, model.neutral(), v, 0.2, method, rtol=1e-8, save=save).q for _ in range(2)]
-    assert np.array_equal(*runs)
-    assert simulate(dyn, np.empty((0, 4)), v, 0.2, method, save=save).q.shape == (0, 21, 4)
-    still = simulate(dyn, model.neutral(), v, 0.0, method, save=[0.0])
-    assert still.q.shape == (1, 4)
-    assert still.stats.steps == 0
 
 
 # Runs that go wrong
@@ -350,40 +306,3 @@ def test_a_step_below_rounding_is_told(method: str) -> None:
     assert run.stats.ended in ("step_too_small", "diverged")
     assert run.stats.reached == pytest.approx(0.7, abs=1e-3)
     assert np.array_equal(run.t, save[:7])
-
-
-@pytest.mark.thorough("states0-radau", "states1-radau", "states1-bdf")
-@pytest.mark.parametrize("method", SCIPY)
-@pytest.mark.parametrize("states", [[0.1], [[0.1], [0.2], [0.3]]])
-def test_a_torque_that_fails_leaves_the_run_up_to_then(method: str, states: Any) -> None:
-    dyn = dynamics(catalog.pendulum())
-    save = np.linspace(0, 1, 11)
-
-    def failing(t: float, q: np.ndarray, v: np.ndarray) -> Any:
-        if t > 0.55:
-            raise ZeroDivisionError("mine")
-        return [0.0]
-
-    with pytest.raises(TorqueError) as caught:
-        simulate(dyn, states, [0.0], 1.0, method, torque=failing, save=save)
-    assert isinstance(caught.value.__cause__, ZeroDivisionError)
-    partial = caught.value.trajectory
-    assert partial.stats.ended == "function_failed"
-    first = partial.q if np.ndim(states) == 1 else partial.q[0]
-    good = simulate(dyn, [0.1], [0.0], 1.0, method, save=save)
-    assert 5 <= len(first) <= 6
-    assert first == pytest.approx(good.q[: len(first)], abs=1e-8)
-    if np.ndim(states) == 2:
-        # Those that were not begun are void.
-        assert np.isnan(partial.q[1:]).all()
-
-
-@pytest.mark.parametrize("method", IMPLICIT)
-def test_an_interruption_gets_through(method: str) -> None:
-    def interrupted(t: float, q: np.ndarray, v: np.ndarray) -> Any:
-        if t > 0.5:
-            raise KeyboardInterrupt
-        return [0.0]
-
-    with pytest.raises(KeyboardInterrupt):
-        simulate(dynamics(catalog.pendulum()), [0.1], [0.0], 1.0, method, torque=interrupted)

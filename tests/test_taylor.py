@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import sys
-import threading
 import warnings
 from itertools import pairwise
 from typing import Any
@@ -19,14 +18,13 @@ import pytest
 import mbkit as mb
 from mbkit import catalog
 from mbkit.codegen.program import program
-from mbkit.codegen.taylor import TaylorSystem, _functions, order_of, precision, rates, taylor_system
+from mbkit.codegen.taylor import TaylorSystem, _functions, order_of, precision, rates
 from mbkit.derivation import Equations
 from mbkit.engines import dynamics
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate import Event, Trajectory, at_section, simulate
 from mbkit.simulate.solvers.taylor import rounded
-from tests.random_trees import random_tree
 from tests.scenes import mounted
 
 hy = pytest.importorskip("heyoka")
@@ -104,27 +102,6 @@ def test_the_oracle_takes_constants_with_32_digits() -> None:
     assert 1e-12 < abs(ends[1] - ends[0]) < 1e-8
 
 
-def test_energy_is_kept_to_rounding(double: Any) -> None:
-    run = taylor(double, [2.0, 1.0], [0.0, 0.5], 5.0)
-    energy = run.energy()
-    assert np.abs(energy - energy[0]).max() < 200 * EPS * np.abs(energy).max()
-
-
-@pytest.mark.thorough("1-kinds0", "4-kinds1")
-@pytest.mark.parametrize(("seed", "kinds"), [(1, ("ball",)), (4, ("free",)), (5, ("helical", "prismatic"))])
-def test_a_tree_with_springs_and_dampers_moves_as_with_dop853(seed: int, kinds: tuple[str, ...]) -> None:
-    """Rotations, quasi-velocities, passive forces and a torque, on two engines."""
-    model = random_tree(seed, n=len(kinds), kinds=kinds)
-    q, v = model.random_state(np.random.default_rng(seed))
-    tau = np.linspace(-1, 1, model.nv)
-    save = np.linspace(0, 1.0, 6)
-    ours = taylor(dynamics(model, "lagrangian"), q, v, 1.0, 1e-13, save=save, torque=tau)
-    theirs = simulate(dynamics(model), q, v, 1.0, "dop853", rtol=1e-13, save=save, torque=tau)
-    size = np.abs(theirs.v).max()
-    assert np.abs(model.difference(ours.q, theirs.q)).max() < 1e-10 * size
-    assert np.abs(ours.v - theirs.v).max() < 1e-10 * size**2
-
-
 def test_a_top_keeps_what_it_must() -> None:
     model = catalog.heavy_top()
     dyn = dynamics(model, "lagrangian")
@@ -161,13 +138,6 @@ def test_saved_states_do_not_change_the_steps(double: Any) -> None:
     # Within a step the series is as good as at its end.
     energy = grid.energy()
     assert np.abs(energy - energy[0]).max() < 200 * EPS * np.abs(energy).max()
-
-
-def test_a_run_of_no_duration_is_its_start(swing: Any) -> None:
-    run = taylor(swing, [1.0], [2.0], 0.0)
-    assert run.t.tolist() == [0.0]
-    assert run.q.tolist() == [[1.0]]
-    assert run.stats.steps == 0
 
 
 def test_later_saved_times_leave_out_the_start(swing: Any) -> None:
@@ -215,22 +185,6 @@ def test_parameters_are_no_reason_to_compile_again(monkeypatch: pytest.MonkeyPat
         taylor(dyn, [1.0], [0.0], rtol=1e-10, save=TIMES).q, taylor(dyn, [1.0], [0.0], rtol=1.1e-10, save=TIMES).q
     )
     assert len(made) == 2 + len(lengths)
-
-
-def test_threads_do_not_meet(double: Any) -> None:
-    alone = taylor(double, [2.0, 1.0], [0.0, 0.0], save=TIMES)
-    found: list[Trajectory] = []
-
-    def work() -> None:
-        found.extend(taylor(double, [2.0, 1.0], [0.0, 0.0], save=TIMES) for _ in range(5))
-
-    threads = [threading.Thread(target=work) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(found) == 20
-    assert all(np.array_equal(run.q, alone.q) for run in found)
 
 
 def test_every_operation_of_a_derivation_has_its_expression() -> None:
@@ -320,23 +274,6 @@ def test_a_singular_point_ends_the_run() -> None:
     assert np.isfinite(run.v).all()
 
 
-def test_an_interruption_gets_through_and_leaves_no_mess(double: Any) -> None:
-    before = taylor(double, [2.0, 1.0], [0.0, 0.0], save=TIMES)
-
-    def interrupted(_t: float, _q: Any, _v: Any) -> float:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        taylor(double, [1.0, 1.0], [0.0, 0.0], events=Event(interrupted))
-    assert np.array_equal(taylor(double, [2.0, 1.0], [0.0, 0.0], save=TIMES).q, before.q)
-
-
-def test_progress_is_told(swing: Any) -> None:
-    told: list[float] = []
-    taylor(swing, [[2.0], [1.0]], [0.0], save=TIMES, progress=told.append)
-    assert told[-1] == 1.0
-
-
 # Bad input
 
 
@@ -364,11 +301,6 @@ def test_without_heyoka_it_is_told_how_to_get_it(monkeypatch: pytest.MonkeyPatch
     dyn = dynamics(catalog.cart_pole(), "lagrangian")
     with pytest.raises(UnsupportedError, match=r"heyoka is not installed; pip install heyoka.*rk853"):
         taylor(dyn, [0.0, 1.0], [0.0, 0.0])
-
-
-def test_systems_go_with_their_equations() -> None:
-    equations = Equations(catalog.pendulum())
-    assert taylor_system(equations) is taylor_system(equations)
 
 
 def test_forces_of_the_time_alone_are_no_jumps() -> None:

@@ -111,28 +111,6 @@ def states(model: Model, count: int = 6) -> list[tuple[np.ndarray, np.ndarray]]:
 # Terms
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_closed_forms_agree_with_themselves(case: str) -> None:
-    """T is ½ vᵀMv, g and the springs are V's slope, and no power is in the velocity force."""
-    build, form = CASES[case][0], CASES[case][1]()
-    model = build()
-    h = 1e-5
-    for q, v in states(model):
-        M = form.mass_matrix(q)
-        assert form.kinetic_energy(q, v) == pytest.approx(v @ M @ v / 2, rel=50 * EPS, abs=1e-300)
-        springs = form.passive(q) if isinstance(form, textbook.Sprung) else np.zeros(model.nv)
-        for i, e in enumerate(np.eye(model.nv)):
-            up, down = (form.potential_energy(model.integrate(q, x * e)) for x in (h, -h))
-            # Central differences: of V's rounding h is left, of its third derivative h² / 6.
-            scale = max(abs(up), abs(springs).max(), 1.0)
-            assert form.gravity(q)[i] - springs[i] == pytest.approx((up - down) / (2 * h), abs=1e-9 * scale)
-        # Along a velocity field of constant v, d/dt ½ vᵀMv is the power of h = C v.
-        ahead, behind = (form.kinetic_energy(model.integrate(q, x * v), v) for x in (h, -h))
-        power = v @ form.velocity_force(q, v)
-        scale = float(np.linalg.norm(M) * np.linalg.norm(v) ** 3)
-        assert power == pytest.approx((ahead - behind) / (2 * h), abs=1e-9 * max(scale, 1e-300))
-
-
 @pytest.mark.parametrize("name", ENGINES)
 @pytest.mark.parametrize("case", CASES)
 def test_engines_agree_with_closed_forms(case: str, name: str) -> None:

@@ -163,12 +163,6 @@ def test_loaded_arm_on_springs(arm):
     assert np.allclose(equilibrium(arm, [0.2, 0.0], tau=held.tau).q, [0.3, -0.2], rtol=0, atol=1e-11)
 
 
-def test_frequencies_are_those_of_small_motions(arm):
-    dyn, rest = arm.dynamics(options=OWN), equilibrium(arm, [0.0, 0.0])
-    told = dyn.forward_dynamics_derivatives(rest.q, [0, 0], [0, 0]).q
-    assert np.allclose(rest.frequencies, np.sqrt(np.sort(np.linalg.eigvals(-told))), rtol=1e-12)
-
-
 def test_bead_on_the_hoop_leaves_the_bottom_above_the_threshold():
     bead = Lagrangian(
         m * R**2 * (w**2 + Om**2 * sp.sin(th) ** 2) / 2,
@@ -229,17 +223,6 @@ def test_holding_torque_of_a_robot_with_a_payload(robot, engine):
     ]
     assert np.abs(held.tau - work).max() < 1e-7
     assert held.residual < 1e-12
-
-
-def test_what_engines_say_of_stability_is_the_same():
-    model = mb.load("ur5")
-    q, _ = model.random_state(np.random.default_rng(3))
-    told = [
-        equilibrium(mb.dynamics(model, e, **(OWN if e == "lagrangian" else {})), holding=q).eigenvalues
-        for e in ("lagrangian", "pinocchio")
-    ]
-    # Roots of what differences of fourth order give.
-    assert np.abs(np.sort(told[0] ** 2) - np.sort(told[1] ** 2)).max() < 1e-8 * np.abs(told[0] ** 2).max()
 
 
 def test_rest_under_constraints():

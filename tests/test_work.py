@@ -24,15 +24,6 @@ def rubbing(**joint: Any) -> Model:
     return block(friction=3.0, **joint).build(point_masses=True)
 
 
-@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
-@pytest.mark.parametrize(("method", "setting"), [("rk4", {"dt": 0.02}), ("rk853", {})])
-def test_friction_takes_f_times_the_way(engine: str, method: str, setting: dict[str, float]) -> None:
-    run = simulate(mb.dynamics(rubbing(), engine), [0.0], [0.5], 2.0, method, torque=[5.0], **setting)
-    # a = (5 - 3)/2, so that 3 m are gone along.
-    assert run.work()[-1] == pytest.approx((5.0 - 3.0) * 3.0, abs=1e-12)
-    assert np.abs(run.power_balance()).max() < 1e-12
-
-
 @pytest.mark.parametrize("save", [None, [0.0, 0.7, 1.5]])
 def test_the_way_back_and_forth_counts_between_saved_states_too(save: Any) -> None:
     """From turn to turn the swing on a spring shrinks by 2 f/k, until the spring cannot pull the block."""

@@ -159,7 +159,7 @@ done:
 
 def kernel(model, quantity, states, elimination):
     """Return the call of a compiled kernel, a batch again and again, and its results, (BATCH, entries)."""
-    code = mb.dynamics(model, "lagrangian", threads=1, elimination=elimination).code(quantity)
+    code = mb.dynamics(model, "lagrangian", threads=1, elimination=elimination)._code(quantity)
     out = np.empty((BATCH, int(np.prod(code.shapes[0]))))
     times = len(states[0]) // BATCH
     sequence = KernelSequence([Call(code, [x[:BATCH] for x in states], [out])])
