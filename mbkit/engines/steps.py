@@ -1,14 +1,14 @@
 """One step of a method, and its exact derivative by the chain rule through the method's own formula.
 
 The formulas of `mbkit.methods` run on any arithmetic; here on values with their derivatives (forward-mode automatic
-differentiation; Griewank and Walther 2008, Evaluating Derivatives, ch. 3), side by side for a batch. Stages that are
-solved for are differentiated by the implicit function theorem.
+differentiation; Griewank and Walther 2008, Evaluating Derivatives, ch. 3), side by side for a batch, with CasADi's
+derivatives of what rotates. Stages that are solved for are differentiated by the implicit function theorem.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,7 +26,9 @@ from mbkit.model import Model
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import tangent_maps
-from mbkit.model.quaternions import Arithmetic
+
+if TYPE_CHECKING:
+    from mbkit.codegen.interpreter import Machine
 
 STEP_DERIVATIVE: Final = Path(
     "derivative of a step",
@@ -224,7 +226,7 @@ class Slopes(NamedTuple):
 
 
 class Dual:
-    """Numbers with derivatives: the value has any shape, the slope the same one and a last axis of directions."""
+    """Vectors of a batch, (N, n), with their derivatives by all that a step depends on, (N, n, columns)."""
 
     __slots__ = ("slope", "value")
     # NumPy's own numbers leave operations with these to them.
@@ -233,95 +235,64 @@ class Dual:
     def __init__(self, value: Array, slope: Array) -> None:
         self.value, self.slope = value, slope
 
-    def _to(self, value: Array, factor: Array) -> Dual:
-        """Return a function's value, from its derivative by this number."""
-        return Dual(value, factor[..., None] * self.slope)
+    def __add__(self, other: Dual) -> Dual:
+        return Dual(self.value + other.value, self.slope + other.slope)
 
-    def __add__(self, other: Any) -> Dual:
-        if isinstance(other, Dual):
-            return Dual(self.value + other.value, self.slope + other.slope)
-        return Dual(self.value + other, self.slope)
+    def __mul__(self, factor: float) -> Dual:
+        return Dual(factor * self.value, factor * self.slope)
 
-    def __sub__(self, other: Any) -> Dual:
-        return self.__add__(-other)
-
-    def __rsub__(self, other: float) -> Dual:
-        return -self + other
-
-    def __neg__(self) -> Dual:
-        return Dual(-self.value, -self.slope)
-
-    def __mul__(self, other: Any) -> Dual:
-        if isinstance(other, Dual):
-            slope = self.value[..., None] * other.slope + other.value[..., None] * self.slope
-            return Dual(self.value * other.value, slope)
-        return Dual(self.value * other, self.slope * other)
-
-    def __truediv__(self, other: Any) -> Dual:
-        if not isinstance(other, Dual):
-            return Dual(self.value / other, self.slope / other)
-        out = self.value / other.value
-        return Dual(out, (self.slope - out[..., None] * other.slope) / other.value[..., None])
-
-    def __rtruediv__(self, other: float) -> Dual:
-        out = other / self.value
-        return self._to(out, -out / self.value)
-
-    def __lt__(self, other: float) -> Any:
-        return self.value < other
-
-    __radd__, __rmul__ = __add__, __mul__
-
-
-def _choose(condition: Array, yes: Any, no: Any) -> Dual:
-    a, b = (x if isinstance(x, Dual) else Dual(np.asarray(x), np.zeros(1)) for x in (yes, no))
-    return Dual(np.where(condition, a.value, b.value), np.where(condition[..., None], a.slope, b.slope))
-
-
-_DUALS: Final = Arithmetic(
-    lambda x: x._to(np.sqrt(x.value), 0.5 / np.sqrt(x.value)),
-    lambda x: x._to(np.sin(x.value), np.cos(x.value)),
-    lambda x: x._to(np.cos(x.value), -np.sin(x.value)),
-    _choose,
-)
+    __rmul__ = __mul__
 
 
 class DualSpace(Space):
-    """The integrators' space on `Dual` vectors: components first, then the states of a batch."""
+    """The integrators' space on `Dual` vectors, with the derivatives of its formulas by CasADi."""
 
-    arithmetic = staticmethod(lambda x: _DUALS)  # noqa: ARG005  # of these numbers there is one kind
-    part = staticmethod(lambda x, part: Dual(x.value[part], x.slope[part]))
-    copied = staticmethod(lambda x: Dual(x.value.copy(), x.slope.copy()))
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self._model = model
+        self._machines: dict[str, Machine] = vars(model).setdefault("_space_derivatives", {})
 
-    @staticmethod
-    def components(x: Any, part: slice) -> list[Any]:
-        """Return the components of a part of a vector."""
-        return [Dual(*pair) for pair in zip(x.value[part], x.slope[part], strict=True)]
+    def _at(self, name: str, *given: Dual) -> Dual:
+        if name not in self._machines:
+            # CasADi is loaded where rotations are differentiated.
+            from mbkit.codegen.interpreter import Machine
+            from mbkit.derivation.steps.symbols import space_derivative
 
-    @staticmethod
-    def put(x: Any, part: slice, components: Any) -> None:
-        """Write components, or a vector, into a part of a vector."""
-        if isinstance(components, Dual):
-            x.value[part], x.slope[part] = components.value, components.slope
-            return
-        for i, one in enumerate(components, part.start):
-            x.value[i], x.slope[i] = one.value, one.slope
+            sizes = [x.value.shape[-1] for x in given]
+            self._machines[name] = Machine(space_derivative(self._model, name, sizes))
+        value, by = self._machines[name](*(np.ascontiguousarray(x.value) for x in given))
+        return Dual(value[..., 0], by @ np.concatenate([x.slope for x in given], axis=-2))
+
+    def retract(self, q: Dual, u: Dual) -> Dual:
+        return q + u if self._adds else self._at("retract", q, u)
+
+    def rate(self, u: Dual, w: Dual) -> Dual:
+        return w if self._adds else self._at("rate", u, w)
+
+    def to_integrator_velocity(self, q: Dual, v: Dual) -> Dual:
+        return self._at("to_integrator_velocity", q, v) if self._free else v
+
+    def to_body_velocity(self, q: Dual, w: Dual) -> Dual:
+        return self._at("to_body_velocity", q, w) if self._free else w
+
+    def acceleration(self, q: Dual, v: Dual, a: Dual) -> Dual:
+        return self._at("acceleration", q, v, a) if self._free else a
 
 
 class _DualStages:
     """Rates of the stages so far, as `mbkit.methods.one_step.Stages`."""
 
     def __init__(self) -> None:
-        self._rates = list[tuple[Any, Any]]()
+        self._rates = list[tuple[Dual, Dual]]()
 
     def __len__(self) -> int:
         return len(self._rates)
 
-    def append(self, u_rate: Any, w_rate: Any) -> None:
+    def append(self, u_rate: Dual, w_rate: Dual) -> None:
         """Add a stage."""
         self._rates.append((u_rate, w_rate))
 
-    def moved(self, h: Any, weights: Array) -> tuple[Any, Any]:
+    def moved(self, h: float, weights: Array) -> tuple[Dual, Dual]:
         """Return h times the weighted sums of u̇ and ẇ."""
         u, w = (0.0 * x for x in self._rates[0])
         for weight, (u_rate, w_rate) in zip(weights.tolist(), self._rates, strict=True):
@@ -355,23 +326,22 @@ class _Rates:
     def __init__(self, space: DualSpace, model: Model, slopes: Callable[..., Slopes]) -> None:
         self._space, self._model, self._slopes = space, model, slopes
 
-    def __call__(self, t: Any, q: Any, u: Any, w: Any) -> tuple[Any, Any]:  # noqa: ARG002  # no time
-        space = self._space
+    def __call__(self, t: Any, q: Dual, u: Dual | None, w: Dual) -> tuple[Dual, Dual]:  # noqa: ARG002  # no time
+        space, n = self._space, self._model.nv
         v = space.to_body_velocity(q, w)
-        here, speed = q.value.T, v.value.T
-        if not (np.isfinite(here).all() and np.isfinite(speed).all()):
+        if not (np.isfinite(q.value).all() and np.isfinite(v.value).all()):
             raise NumericalError("the state within a step is not finite; take shorter steps")
-        at = self._slopes(here, speed)
-        turn = q.slope.swapaxes(0, 1)
-        if self._model.quaternions:
-            turn = tangent_maps(self._model, here)[1] @ turn
-        slope = at.q @ turn + at.v @ v.slope.swapaxes(0, 1)
-        n = self._model.nv
+        at = self._slopes(q.value, v.value)
+        slope = at.q @ _on_tangents(self._model, q) + at.v @ v.slope
         # Behind δq and δv stand the columns of τ and the parameters.
         slope[..., 2 * n : 3 * n] += at.tau
         slope[..., 3 * n : 3 * n + at.parameters.shape[-1]] += at.parameters
-        a = Dual(at.a.T, slope.swapaxes(0, 1))
-        return w if u is None else space.rate(u, w), space.acceleration(q, v, a)
+        return w if u is None else space.rate(u, w), space.acceleration(q, v, Dual(at.a, slope))
+
+
+def _on_tangents(model: Model, q: Dual) -> Array:
+    """Return the derivatives of q as those of a displacement in the tangent space."""
+    return tangent_maps(model, q.value)[1] @ q.slope if model.quaternions else q.slope
 
 
 def step_derivatives(
@@ -408,9 +378,9 @@ def step_derivatives(
         return q1[0], v1[0], out[0]
     n, formula, space = model.nv, method.formula, DualSpace(model)
     columns, rates = 3 * n + parameters, _Rates(space, model, slopes)
-    start_q, start_v = (Dual(x.T, np.zeros((*x.T.shape, columns))) for x in (q, v))
-    start_q.slope[..., :n] = tangent_maps(model, q)[0].swapaxes(0, 1)
-    start_v.slope[range(n), :, range(n, 2 * n)] = 1.0
+    start_q, start_v = (Dual(x, np.zeros((*x.shape, columns))) for x in (q, v))
+    start_q.slope[..., :n] = tangent_maps(model, q)[0]
+    start_v.slope[:, range(n), range(n, 2 * n)] = 1.0
     w = space.to_integrator_velocity(start_q, start_v)
     if isinstance(formula, ImplicitTableau):
         end_q, end_w = _implicit_step(formula, space, rates, dt, start_q, w)
@@ -418,9 +388,7 @@ def step_derivatives(
         assert isinstance(formula, (Tableau, SemiImplicitEuler))
         end_q, end_w, _ = formula.step(space, rates, _DualStages(), 0.0, dt, start_q, w)
     end_v = space.to_body_velocity(end_q, end_w)
-    q1, v1 = end_q.value.T, end_v.value.T
-    moved = tangent_maps(model, q1)[1] @ end_q.slope.swapaxes(0, 1)
-    return q1, v1, np.concatenate([moved, end_v.slope.swapaxes(0, 1)], axis=-2)
+    return end_q.value, end_v.value, np.concatenate([_on_tangents(model, end_q), end_v.slope], axis=-2)
 
 
 def _implicit_step(tableau: ImplicitTableau, space: DualSpace, rates: _Rates, h: float, q: Dual, w: Dual) -> Any:
@@ -428,24 +396,24 @@ def _implicit_step(tableau: ImplicitTableau, space: DualSpace, rates: _Rates, h:
 
     Newton's iteration solves G(k, x) = k - F(u(k), w + ..., x) = 0 to rounding; then dk = -G_k⁻¹ G_x dx.
     """
-    n, size, columns = space.nv, q.value.shape[1], q.slope.shape[-1]
+    n, size, columns = space.nv, len(q.value), q.slope.shape[-1]
     s, A = tableau.stages, tableau.A
     # Directions of one stage's u and w stand behind the columns of the result.
-    q_wide, w0 = _padded(q, 2 * n), w
-    seed_u, seed_w = (np.zeros((n, size, columns + 2 * n)) for _ in range(2))
-    seed_u[range(n), :, range(columns, columns + n)] = 1.0
-    seed_w[range(n), :, range(columns + n, columns + 2 * n)] = 1.0
+    wide = Dual(q.value, np.concatenate([q.slope, np.zeros((*q.value.shape, 2 * n))], axis=-1))
+    seed_u, seed_w = (np.zeros((size, n, columns + 2 * n)) for _ in range(2))
+    seed_u[:, range(n), range(columns, columns + n)] = 1.0
+    seed_w[:, range(n), range(columns + n, columns + 2 * n)] = 1.0
     k = np.zeros((s, size, 2 * n))
-    k[..., :n] = w.value.T
+    k[..., :n] = w.value
     last = np.full(size, np.inf)
     for _ in range(_MAX_NEWTON_ITERATIONS):
         stages = h * np.einsum("ij,jbm->ibm", A, k)
         J, by_x, miss = np.empty((s, size, 2 * n, 2 * n)), np.empty((s, size, 2 * n, columns)), np.empty(k.shape)
         for i in range(s):
-            u, speed = Dual(stages[i, :, :n].T, seed_u), Dual(w0.value + stages[i, :, n:].T, seed_w)
-            pair = rates(0.0, space.retract(q_wide, u), u, speed)
-            slope = np.concatenate([x.slope.swapaxes(0, 1) for x in pair], axis=-2)
-            miss[i] = k[i] - np.concatenate([x.value.T for x in pair], axis=-1)
+            u, speed = Dual(stages[i, :, :n], seed_u), Dual(w.value + stages[i, :, n:], seed_w)
+            pair = rates(0.0, space.retract(wide, u), u, speed)
+            slope = np.concatenate([x.slope for x in pair], axis=-2)
+            miss[i] = k[i] - np.concatenate([x.value for x in pair], axis=-1)
             by_x[i], J[i] = slope[..., :columns], slope[..., columns:]
         coupled = -h * np.einsum("ij,ibkl->bikjl", A, J).reshape(size, s * 2 * n, s * 2 * n)
         coupled += np.eye(s * 2 * n)
@@ -457,12 +425,11 @@ def _implicit_step(tableau: ImplicitTableau, space: DualSpace, rates: _Rates, h:
     else:
         raise NumericalError(f"{tableau.name}: the iteration does not solve the stages; take shorter steps")
     # The stages depend on w through their own w.
-    by_w = np.einsum("ibkl,blm->ibkm", J[..., n:], w0.slope.swapaxes(0, 1))
+    by_w = np.einsum("ibkl,blm->ibkm", J[..., n:], w.slope)
     right = (by_x + by_w).swapaxes(0, 1).reshape(size, s * 2 * n, columns)
     slopes = np.linalg.solve(coupled, right).reshape(size, s, 2 * n, columns)
-    value, slope = h * np.einsum("i,ibm->bm", tableau.b, k), h * np.einsum("i,bimc->mbc", tableau.b, slopes)
-    end = Dual(value.T, slope)
-    u, dw = (Dual(end.value[part], end.slope[part]) for part in (slice(n), slice(n, None)))
+    value, slope = h * np.einsum("i,ibm->bm", tableau.b, k), h * np.einsum("i,bimc->bmc", tableau.b, slopes)
+    u, dw = (Dual(value[:, part], slope[:, part]) for part in (slice(n), slice(n, None)))
     return space.retract(q, u), w + dw
 
 
@@ -496,7 +463,3 @@ def momentum_step_slopes(
     q1 = q1[..., 0]
     moved = tangent_maps(model, q1)[1] @ (q1_by_y @ slopes + q1_by_x)
     return q1, y[..., n:], np.concatenate([moved, slopes[..., n:, :]], axis=-2)
-
-
-def _padded(x: Dual, more: int) -> Dual:
-    return Dual(x.value, np.concatenate([x.slope, np.zeros((*x.slope.shape[:-1], more))], axis=-1))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final
 
 import casadi as ca
 
+from mbkit.model import Model
 from mbkit.model.integration_space import Space
 from mbkit.model.quaternions import Arithmetic
 
@@ -33,3 +35,11 @@ class SymbolicSpace(Space):
     def put(x: Any, part: slice, components: Any) -> None:
         """Write scalars or a column into a part of a column."""
         x[part] = ca.vertcat(*components) if isinstance(components, list) else components
+
+
+def space_derivative(model: Model, name: str, sizes: Sequence[int]) -> ca.Function:
+    """Return a method of the space as a function of columns, with its derivative by all of them side by side."""
+    given = [ca.SX.sym(f"x{i}", n) for i, n in enumerate(sizes)]
+    out = getattr(SymbolicSpace(model), name)(*given)
+    results = [ca.densify(x) for x in (out, ca.jacobian(out, ca.vertcat(*given)))]
+    return ca.Function(name, given, results)
