@@ -56,21 +56,6 @@ def states(model: Model) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(model.neutral(), np.zeros(model.nv)), *zip(q, 3 * v, strict=True)]
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_closed_forms_agree_with_themselves(case: str) -> None:
-    """T is ½ vᵀMv, and g is V's slope: the two ways in which the oracle was written."""
-    model, form = CASES[case]
-    for q, v in states(model):
-        M = form.mass_matrix(q)
-        assert form.kinetic_energy(q, v) == pytest.approx(v @ M @ v / 2, rel=50 * EPS, abs=1e-300)
-        h = 1e-6
-        for i in range(model.nv):
-            step = h * np.eye(model.nv)[i]
-            slope = form.potential_energy(model.integrate(q, step)) - form.potential_energy(model.integrate(q, -step))
-            scale = model.mass * 9.81
-            assert form.gravity(q)[i] == pytest.approx(slope / (2 * h), abs=1e-8 * scale)
-
-
 @pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("name", ENGINES)
 @pytest.mark.parametrize("case", CASES)
@@ -191,38 +176,6 @@ def test_registry() -> None:
         catalog.get("cartpole")
     catalog.systems().clear()
     assert catalog.systems(), "the registry was handed out, not a copy"
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_engines_take_a_system_with_a_loop_or_refuse_it_by_its_name(engine: str) -> None:
-    model = catalog.slider_crank()
-    dyn = dynamics(model, engine)
-    if ENGINES[engine].name == "drake":
-        # M is that of the tree, and accelerations are refused.
-        own = dynamics(model, "lagrangian").mass_matrix(model.neutral())
-        np.testing.assert_allclose(dyn.mass_matrix(model.neutral()), own, rtol=1e-13)
-        with pytest.raises(UnsupportedError, match=r"forward_dynamics.*'lagrangian'"):
-            dyn.forward_dynamics(model.neutral(), np.zeros(3), np.zeros(3))
-        return
-    q, v = model.random_state(0)
-    assert np.abs(dyn.constraint_residual(q)).max() < 1e-12
-    assert np.isfinite(dyn.forward_dynamics(q, v, np.zeros(3))).all()
-
-
-@pytest.mark.thorough("pinocchio-bicycle", "lagrangian-bicycle", "oracle-bicycle")
-@pytest.mark.parametrize("name", ["rolling_disc", "chaplygin_sleigh", "bicycle"])
-@pytest.mark.parametrize("engine", ENGINES)
-def test_engines_take_a_system_that_rolls_or_refuse_it_by_its_name(engine: str, name: str) -> None:
-    model = catalog.get(name)()
-    q, v = model.random_state(0)
-    if ENGINES[engine].name in ("drake", "mujoco"):
-        with pytest.raises(UnsupportedError, match=rf"{name}.*'{model.no_slip[0].name}'.*'lagrangian'"):
-            # Drake has the terms of its tree.
-            dynamics(model, engine).forward_dynamics(q, v, np.zeros(model.nv))
-        return
-    dyn = dynamics(model, engine)
-    assert np.abs(dyn.constraint_rate(q, v)).max() < 1e-12
-    assert np.isfinite(dyn.forward_dynamics(q, v, np.zeros(model.nv))).all()
 
 
 @pytest.mark.parametrize("name", catalog.systems())

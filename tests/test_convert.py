@@ -15,16 +15,7 @@ from mbkit.cli import cli
 from mbkit.engines.mujoco.mjcf_writer import mjcf_text, read_back
 from mbkit.errors import InputError, MbkitError, OutputError, UnknownNameError, UnsupportedError
 from mbkit.load import xml_reader
-from tests.plain_mechanics import random_case
 from tests.random_trees import IN_MUJOCO, random_tree
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_a_tree_of_every_kind_survives_mjcf(seed: int) -> None:
-    model = random_tree(seed, 9, kinds=IN_MUJOCO, damping=False, mimic=seed % 2 == 0)
-    made = mb.convert(model, "mjcf")
-    assert made.worst < 1e-12
-    assert "without geometry" in made.text
 
 
 @pytest.mark.parametrize("name", [0, 1, 2, "tiago_no_hand", "talos"])
@@ -160,12 +151,6 @@ def test_roll_pitch_yaw_are_those_of_the_matrix_next_to_a_right_angle_too() -> N
         roll, yaw = rng.uniform(-3, 3, 2)
         R = spatial.matrix_from_rpy(roll, pitch, yaw)
         np.testing.assert_allclose(spatial.matrix_from_rpy(*spatial.rpy_from_matrix(R)), R, rtol=0, atol=2e-15)
-
-
-def test_loops_beside_mimic_joints_are_refused_by_name() -> None:
-    # MuJoCo would hold both softly, and its terms of them are none to read back.
-    with pytest.raises(UnsupportedError, match="while joint 'j2' follows 'j0'"):
-        mb.convert(random_case(148).model(), "mjcf")
 
 
 def test_the_door(tmp_path: Path) -> None:

@@ -167,16 +167,6 @@ def test_other_names_copies_and_parameters_keep_the_motion(seed: int) -> None:
     assert [x.name for x in b.build().couplers] == ["coupler0"]
 
 
-def test_runs_stay_on_the_couplers() -> None:
-    model = coupled(random_tree(2, 8, ("revolute", "prismatic"), armature=False, nearest=3), 2)
-    q, v, _ = state(model, 2)
-    run = mb.simulate(mb.dynamics(model, "lagrangian"), q, v, 0.1, dt=1e-3)
-    other = mb.simulate(mb.dynamics(model, "pinocchio"), q, v, 0.1, dt=1e-3)
-    assert off(run.q[-1], other.q[-1]) < 1e-12
-    assert np.abs(dynamics(model, "oracle").constraint_residual(run.q)).max() < 1e-13
-    assert mb.compare(model, ("pinocchio", "lagrangian", "mujoco"), samples=4, terms_only=True).passed
-
-
 # Epicyclic trains
 
 TEETH = (20, 60)
@@ -378,19 +368,6 @@ def test_what_is_no_coupler_is_refused_by_name(leader: Any, more: dict[str, Any]
         b.build()
     # A faulty number brings no other fault along.
     assert ("zero for all" in str(caught.value)) is ("zero for all" in words)
-
-
-def test_parts_made_alone_are_checked_too() -> None:
-    for faulty, words in (
-        (lambda: Coupler("c", "a", 3), "leader: expected the name of a joint or a tuple"),  # type: ignore[arg-type]
-        (lambda: Coupler("c", "a", ("b", 3)), "leader: expected the name"),  # type: ignore[arg-type]
-        (lambda: Coupler("c", "a", ("b", "d"), np.ones(3)), r"ratio: expected shape \(2,\), got \(3,\)"),
-        (lambda: Coupler("c", "a", "b", np.ones(2)), r"ratio: expected shape \(\), got \(2,\)"),
-    ):
-        with pytest.raises(ModelError, match=words):
-            faulty()
-    with pytest.raises(InputError, match=r"leading: expected shape \(2,\), got \(1,\)"):
-        Coupler("c", "a", ("b", "d")).follow([1.0])
 
 
 def test_what_cannot_be_held_or_solved_is_refused_by_name() -> None:

@@ -16,7 +16,7 @@ import pytest
 
 import mbkit as mb
 from mbkit.engines import ENGINES, QUANTITIES, Dynamics
-from mbkit.errors import InputError, MbkitError, MbkitWarning, NumericalError, UnknownNameError, UnsupportedError
+from mbkit.errors import InputError, MbkitError, MbkitWarning, NumericalError, UnsupportedError
 from mbkit.model import kind_of
 from mbkit.model.joint_types import KINDS
 from tests.random_trees import SOUND, off, random_tree, states
@@ -336,22 +336,6 @@ def test_batches_must_be_of_one_size(engine):
     dyn = mb.dynamics(mb.load("ur5"), engine)
     with pytest.raises(InputError, match="q has 2, v has 3"):
         dyn.nle(np.zeros((2, 6)), np.zeros((3, 6)))
-
-
-def test_unknown_names_suggest_near_ones():
-    model = mb.load("ur5")
-    with pytest.raises(UnknownNameError, match="pinocchio"):
-        mb.dynamics(model, "pinochio")
-    with pytest.raises(UnknownNameError, match="wrist_3_link"):
-        mb.dynamics(model).pose(model.neutral(), "wrist3_link")
-    with pytest.raises(InputError, match="frame: expected a name or a list"):
-        mb.dynamics(model).pose(model.neutral(), 3)
-    for engine in ENGINES:
-        assert np.array_equal(mb.dynamics(model, engine).pose(model.neutral(), "world"), np.eye(4))
-    with pytest.raises(InputError, match="axes"):
-        mb.dynamics(model).jacobian(model.neutral(), "wrist_3_link", "mine")
-    with pytest.raises(InputError, match="Model"):
-        mb.dynamics("ur5")
 
 
 def test_what_an_engine_cannot_do_has_a_reason():

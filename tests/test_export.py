@@ -321,25 +321,6 @@ def test_a_folder_without_permission_is_told(tmp_path):
 # The functions themselves, for optimal control.
 
 
-def test_functions_have_the_stated_names_and_dense_shapes():
-    model = random_tree(2, 10)
-    dyn = mb.dynamics(model, "lagrangian")
-    one = {"kinetic_energy": (1, 1), "potential_energy": (1, 1), "energy_rate": (1, 1)}
-    square = ("mass_matrix", "mass_matrix_inverse", "coriolis_matrix")
-    for name, arguments in FUNCTIONS.items():
-        if name.endswith("derivatives"):
-            continue
-        f = dyn.function(name)
-        assert f.name_in() == list(arguments)
-        assert f.name_out() == [name]
-        assert [f.size1_in(k) for k in range(f.n_in())] == [model.nq if n == "q" else model.nv for n in arguments]
-        assert f.size_out(0) == one.get(name, (model.nv, model.nv if name in square else 1))
-        assert f.sparsity_out(0).is_dense()
-    J = dyn.equations.body_quantity("jacobian", ("tip",), "world")
-    assert J.size_out(0) == (6, model.nv)
-    assert J.sparsity_out(0).is_dense()
-
-
 def test_functions_serve_in_an_optimal_control_expression():
     # Two steps of Euler's method as MX, and the sensitivity of where they end to the torque.
     model = mb.load("ur5").without("damping")

@@ -66,14 +66,6 @@ def test_members_change_phases_at_their_own_times(method: str, seed: int) -> Non
     require_same(*together_and_alone(dyn, q, v, method, {"torque": rows}, save=[0.0, 7 * STEP, 50 * STEP, DURATION]))
 
 
-@pytest.mark.parametrize("method", ["rk4", "gauss4"])
-def test_members_under_a_force_of_t(method: str) -> None:
-    model = pushed_in_time(rubbed(3, 3, SINGLE))
-    q, v, _ = mostly_at_rest(model, 7)
-    dyn = mb.dynamics(model, "lagrangian", compile=method == "rk4")
-    require_same(*together_and_alone(dyn, q, v, method, {}, t0=0.3))
-
-
 def test_members_under_wrenches_with_parameters_of_their_own() -> None:
     b = mb.ModelBuilder.of(rubbed(4, 3, SINGLE))
     b.set_body(b.build().bodies[1].name, mass=mb.Parameter("m", 1.0))

@@ -83,13 +83,6 @@ def test_random_trees_move_as_they_do(seed):
     assert_same(model, from_model(model))
 
 
-@pytest.mark.thorough("kinds1", "kinds2")
-@pytest.mark.parametrize("kinds", [("universal", "revolute"), ("spherical_zyx",), ("planar", "revolute")])
-def test_joints_of_several_velocities_move_as_they_do(kinds):
-    model = random_tree(7, len(kinds), kinds, armature=False)
-    assert_same(model, from_model(model))
-
-
 @pytest.mark.thorough("1-kinds1", "1-kinds2", "2-kinds1", "2-kinds2")
 @pytest.mark.parametrize("kinds", [("free",), ("ball", "revolute"), ("free", "prismatic")])
 @pytest.mark.parametrize("seed", [1, 2])
@@ -206,12 +199,6 @@ def test_names_of_several_free_bodies_differ():
     ]
     assert [s.name for s in lag.velocities][-3:] == ["omega_c1", "omega_c2", "omega_c3"]
     assert r"\dot{\omega}" in lag.equations().latex()
-
-
-@pytest.mark.thorough
-def test_a_robot_moves_as_it_does():
-    model = mb.load("ur5")
-    assert_same(model, from_model(model, coordinates=[f"q{i}" for i in range(1, 7)]))
 
 
 def test_named_parameters_stay_and_move():
@@ -360,11 +347,6 @@ def test_what_cannot_be_written_is_refused_with_the_reason():
         from_model(mb.catalog.pendulum(), coordinates=["l"])
 
 
-def test_a_written_model_is_its_system():
-    lag = from_model(mb.catalog.pendulum())
-    assert from_model(lag.model) is lag
-
-
 a, b, c, x, y = sp.symbols("a b c x y")
 
 
@@ -415,20 +397,6 @@ def test_fractions_where_people_write_them():
     assert number(Fraction(1, 12)) == sp.Rational(1, 12)
     assert number(Fraction("9.81")) == sp.Float(9.81)
     assert number(Fraction(7, 2)) == sp.Rational(7, 2)
-
-
-def test_a_damper_on_a_prescribed_joint_alone_acts_on_nothing():
-    b = mb.ModelBuilder("driven")
-    for name in ("a", "c"):
-        b.add_body(name, mass=1.0, com=(1, 0, 0))
-    b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 1, 0), damping=0.3)
-    b.add_joint("k", "revolute", parent="a", child="c", axis=(0, 1, 0), translation=(1, 0, 0))
-    b.prescribe("j", rate=1.0)
-    model = b.build()
-    damped, free = (from_model(m).dynamics(options={"compile": False}) for m in (model, model.without("damping")))
-    state = [0.1], [0.2], [0.3]
-    assert np.array_equal(damped.forward_dynamics(*state), free.forward_dynamics(*state))
-    assert from_model(model, drives=True).dissipation != 0
 
 
 @pytest.mark.thorough

@@ -231,16 +231,6 @@ def test_xml_reads_back_the_names_or_refuses(to):
         mb.convert(robot(), to)
 
 
-@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
-def test_c_compiles_and_calls_nothing_from_a_name(tmp_path):
-    header, source = mb.lagrangian.export_c(robot()).write(tmp_path)
-    for path in (header, source):
-        assert is_seen(path.read_text())
-        code = re.sub(r"/\*.*?\*/", "", path.read_text(), flags=re.DOTALL)
-        assert "import" not in code.replace(header.stem, "")
-    subprocess.run(["cc", "-std=c99", "-trigraphs", "-Wall", "-Werror", "-c", source.name], cwd=tmp_path, check=True)
-
-
 #: What a person types; {} is the hostile system.
 COMMANDS = [
     "check {} --samples 1 --no-rollouts",

@@ -131,18 +131,6 @@ def test_an_exact_torque_does_not_hide_the_others(known: int) -> None:
     assert (np.abs(values(found) - model.base_parameters().values) < 5 * deviations(found) + 1e-9).all()
 
 
-def test_a_weight_of_zero_leaves_a_torque_out() -> None:
-    model = arm()
-    q, v, a = motion(model)
-    tau = torques(model, q, v, a)
-    weights = np.ones(tau.shape)
-    tau[::7, 1] += 100.0
-    weights[::7, 1] = 0.0
-    found = mb.identify(other_masses(model), q, v, a, tau, weights=weights, friction=True, rest=0.0)
-    assert np.allclose(values(found)[: model.base_parameters().count], model.base_parameters().values, atol=1e-10)
-    assert found.residuals[1].samples == len(tau) - len(tau[::7])
-
-
 @pytest.mark.parametrize("physical", [False, True])
 def test_friction_and_armature_are_found_and_written_back(physical: bool) -> None:
     true = arm()

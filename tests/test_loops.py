@@ -486,26 +486,6 @@ def test_faults_of_loops_and_motions_and_what_nothing_is_left_of_are_refused():
         twice.embedded()
 
 
-class TreeAlone(mb.engines.Dynamics):
-    """An engine of one's own that knows nothing of loops."""
-
-    engine = "tree_alone"
-
-
-@pytest.mark.parametrize("feature", ["loops", "prescribed"])
-def test_engines_tell_the_way(feature):
-    model = slider_crank(lambda b: b.prescribe("theta", rate=P("speed", 1.0)))
-    other = {"loops": "prescribed", "prescribed": "loops"}[feature]
-    assert mb.dynamics(model.without(other), "lagrangian").constraint_names
-    with pytest.raises(UnsupportedError, match=rf"dynamics\(model, 'lagrangian'\).*without\('{feature}'\)"):
-        TreeAlone(model.without(other))
-    bare = model.without("loops", "prescribed")
-    assert "speed" in model.parameters
-    assert "speed" not in bare.parameters
-    assert model.with_parameters(speed=2.0).prescribed[0].rate == 2.0
-    assert model.with_parameters(L2=0.4).loops[0].translation_a[0] == 0.4
-
-
 def test_the_truth_of_the_four_bar_has_the_accelerations_of_the_derivation():
     """J(θ) θ̈ + ½ J' θ̇² + V' = 0 in closed form, beside multipliers, all around the circle."""
     model = bare.described()

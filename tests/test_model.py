@@ -326,22 +326,6 @@ def test_needs_are_read_off_the_description():
     assert timed.build().needs.time
 
 
-def test_names_address_coordinates_and_models_show_themselves():
-    model = random_tree(3, 10)
-    assert len(model.coordinate_names) == len(set(model.coordinate_names)) == model.nq
-    assert len(model.velocity_names) == model.nv
-    for joint in model.independent_joints:
-        part = model.layout.q[joint.name]
-        assert all(n.startswith(joint.name) for n in model.coordinate_names[part])
-    with pytest.raises(UnknownNameError, match="j3"):
-        model.joint("j33")
-    model = random_tree(3, 4, ("revolute", "prismatic"), mimic=True)
-    assert f"nv={model.nv}" in repr(model)
-    page = replace(model, name="<script>")._repr_html_()
-    assert "<script>" not in page
-    assert "j0" in page
-
-
 # Mimic joints
 
 
@@ -357,15 +341,6 @@ def test_chains_of_mimics_are_resolved_to_free_joints():
     y1 = -3 * y0 + 0.5
     assert model.layout.expand_q(np.array([q])) == pytest.approx([q, y0, y1, 0.5 * y1])
     assert model.layout.expand_v(np.array([1.0])) == pytest.approx([1, 2, -6, -3])
-
-
-def test_reduced_mass_matrix_is_that_of_the_constrained_motion():
-    model = random_tree(1, 10, mimic=True, springs=False)
-    assert model.needs.mimic
-    free = replace(model, joints=tuple(replace(j, mimic=None) for j in model.joints))
-    G, q = model.layout.G, model.random_state(np.random.default_rng(0))[0]
-    M_full = mb.dynamics(free).mass_matrix(model.layout.expand_q(q))
-    assert off(mb.dynamics(model).mass_matrix(q), G.T @ M_full @ G) < 1e-15
 
 
 # The builder's checks
@@ -508,21 +483,6 @@ def test_the_builders_own_mass_matrix_is_right(seed):
     assert off(sample_mass_matrix(model), mb.dynamics(model).mass_matrix(q)) < 1e-14
 
 
-@pytest.mark.parametrize("call", ["integrate", "difference"])
-def test_wrong_configurations_are_explained(call):
-    model = random_tree(1, 4, ("free", "revolute"))
-    q, v, _, _ = (x[0] for x in states(model, 1))
-    second = v if call == "integrate" else q
-    for wrong, other, words in (
-        (q[:-1], second, "expected shape"),
-        (q * np.nan, second, "finite"),
-        (2 * q, second, "norm"),
-        (np.stack([q] * 2), np.stack([second] * 3), "different sizes"),
-    ):
-        with pytest.raises(InputError, match=words):
-            getattr(model, call)(wrong, other)
-
-
 # How public names look in a shell.
 
 
@@ -621,16 +581,6 @@ def test_what_cannot_be_is_refused_by_replace_too(part: str, changed: dict[str, 
 
     with pytest.raises(ModelError, match=says):
         replace(model, **({"bodies": parts("bodies"), "joints": parts("joints")} if part else changed))
-
-
-def test_shapes_are_checked_by_replace_too() -> None:
-    model = mb.load("ur5")
-    with pytest.raises(ModelError, match="rotation is not a rotation matrix"):
-        replace(model.joint(ELBOW), rotation=2 * np.eye(3))
-    with pytest.raises(ModelError, match=r"damping: expected shape \(1,\), got \(2,\)"):
-        replace(model.joint(ELBOW), damping=[1.0, 2.0])
-    # What a list gives is numbers as well.
-    assert replace(model.bodies[0], com=[1, 2, 3]).com.tolist() == [1.0, 2.0, 3.0]
 
 
 def test_what_a_loader_took_as_written_stays_so() -> None:

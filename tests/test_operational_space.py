@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit.errors import InputError, NumericalError, SingularPoseWarning
+from mbkit.errors import NumericalError, SingularPoseWarning
 from tests.random_trees import random_tree, states
 
 EPS = np.finfo(float).eps
@@ -104,20 +104,3 @@ def test_the_damped_inertia_is_that_of_the_least_singular_value_allowed():
             for damping in (0.1, 0.2)
         ]
     assert largest[0] / largest[1] == pytest.approx(4.0, rel=1e-3)
-
-
-def test_bad_arguments_are_named():
-    dyn = mb.dynamics(mb.catalog.double_pendulum(), "lagrangian")
-    for more, message in (
-        ({"rows": "both"}, "rows: expected 'linear'"),
-        ({"rows": [0, 0]}, "rows: expected different"),
-        ({"rows": []}, "rows: expected different"),
-        ({"damping": 2.0}, "damping: expected"),
-        ({"axes": "mine"}, "axes: expected"),
-    ):
-        with pytest.raises(InputError, match=message):
-            mb.operational_space(dyn, [0.0, 1.0], "tip", **more)
-    with pytest.raises(InputError, match="frame: expected a name"):
-        mb.operational_space(dyn, [0.0, 1.0], ["tip"])
-    with pytest.raises(InputError, match="Dynamics"):
-        mb.operational_space(dyn.model, [0.0, 1.0], "tip")

@@ -204,11 +204,6 @@ def test_couplers_of_joints_are_compared(tmp_path: Path) -> None:
         assert "missing" in result.to_markdown()
 
 
-def test_a_coupler_that_is_switched_off_is_none(tmp_path: Path) -> None:
-    found = couplers(compared(tmp_path, "0 0 0", "", COUPLED.format("-0.5", 'active="false"')))
-    assert all(stage.same is True for stage in found.values())
-
-
 @pytest.mark.parametrize("swapped", [False, True])
 def test_a_coupler_s_numbers_are_those_of_either_of_its_joints(swapped: bool) -> None:
     written = mb.model.Coupler("c", "a", "b", -0.5, 0.1)

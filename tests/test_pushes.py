@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from typing import Any
 
 import numpy as np
@@ -165,17 +164,6 @@ def test_engines_own_integrators_refuse_by_name() -> None:
 # Forms of the argument
 
 
-@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
-def test_samples_are_pieces_of_constants(engine: str, own: Dynamics, start: Any) -> None:
-    dyn = own if engine == "lagrangian" else mb.dynamics(own.model, engine)
-    q, v, frame = start[0][0], start[1][0], tip(own.model)
-    samples = np.random.default_rng(2).standard_normal((4, 6))
-    whole = mb.simulate(dyn, q, v, 0.04, dt=0.01, wrenches={frame: samples}, torque=np.ones(own.model.nv))
-    for k, w in enumerate(samples):
-        q, v = dyn.step(q, v, np.ones(own.model.nv), 0.01, wrenches={frame: w})
-        np.testing.assert_array_equal(np.concatenate([q, v]), np.concatenate([whole.q[k + 1], whole.v[k + 1]]))
-
-
 def test_a_batch_is_its_trajectories(own: Dynamics, start: Any) -> None:
     rng, frame = np.random.default_rng(2), tip(own.model)
     each, held, torque = rng.standard_normal((3, 6)), rng.standard_normal((3, 4, 6)), rng.standard_normal((4, 5))
@@ -234,25 +222,6 @@ def test_the_work_of_wrenches_is_the_change_of_the_energy(axes: str) -> None:
         assert np.abs(run.work()).max() > 1e-2
     assert off[1] < off[0] / 4**3
     assert off[1] < 1e-6 * np.abs(run.energy()).max()
-
-
-def test_functions_do_work_too_and_survive_a_pickle() -> None:
-    model = brick()
-    dyn = mb.dynamics(model, "lagrangian")
-
-    def spring(_t: float, q: np.ndarray, _v: np.ndarray) -> np.ndarray:
-        return np.array([*(-3.0 * q[:3]), 0, 0, 0])
-
-    given: dict[str, Any] = {"wrenches": {"brick": spring}, "wrench_axes": "local_world_aligned", "dt": 0.01}
-    run = mb.simulate(dyn, model.neutral(), [1.0, 0.5, 0, 1, 2, 3], 1.0, **given)
-    # A spring: its energy is 3/2 |p|².
-    stored = 1.5 * np.sum(run.q[:, :3] ** 2, axis=1)
-    np.testing.assert_allclose(run.work(), -stored, rtol=0, atol=1e-7)
-    again = pickle.loads(pickle.dumps(run))
-    np.testing.assert_array_equal(again.wrenches()["brick"], run.wrenches()["brick"])
-    np.testing.assert_allclose(again.work(), run.work(), rtol=0, atol=1e-12)
-    assert not run.tau.any()
-    assert run.tau.shape == run.v.shape
 
 
 def test_functions_stand_beside_samples() -> None:

@@ -5,9 +5,6 @@
 
 from __future__ import annotations
 
-import copy
-import dataclasses
-import pickle
 import sys
 from typing import Any
 
@@ -19,11 +16,9 @@ import mbkit as mb
 from mbkit import catalog
 from mbkit.engines import dynamics
 from mbkit.errors import InputError, NumericalError, UnsupportedError
-from mbkit.model import Model
 from mbkit.simulate import simulate
 from mbkit.studies.motions import reference as module
 from mbkit.studies.motions.reference import (
-    Reference,
     checked_motion,
     gap,
     reference,
@@ -276,30 +271,11 @@ def test_parameters_have_their_values() -> None:
 # The object, and bad input
 
 
-def test_a_reference_is_frozen_and_travels() -> None:
-    truth = reference(catalog.pendulum(), [1.0], [0.0], 1.0, [0, 1.0])
-    again = pickle.loads(pickle.dumps(truth))
-    assert np.array_equal(again.q, truth.q)
-    assert again.how == truth.how
-    for one in (truth, again, copy.deepcopy(truth)):
-        assert not any(getattr(one, x).flags.writeable for x in ("t", "q", "v", "q_low", "v_low", "floor"))
-    assert repr(truth).startswith("<Reference to t = 1 s, ")
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        truth.horizon = 2.0  # type: ignore[misc]
-
-
 @pytest.mark.parametrize("duration", [0.0, 1.0])
 def test_what_rests_is_known(duration: float) -> None:
     truth = reference(catalog.pendulum(), [0.0], [0.0], duration, [0.0, duration] if duration else [0.0])
     assert truth.horizon == duration
     assert (truth.q == 0).all()
-
-
-def test_progress_goes_forward() -> None:
-    told: list[float] = []
-    reference(catalog.double_pendulum(), [2.0, 1.0], [0.0, 0.0], 3.0, TIMES, progress=told.append)
-    assert told[-1] == 1.0
-    assert told == sorted(told)
 
 
 def test_an_interruption_gets_through(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -337,14 +313,6 @@ def test_bad_input_is_named(change: dict[str, Any], message: str) -> None:
     }
     with pytest.raises(InputError, match=message):
         reference(**(good | change))
-
-
-def test_a_model_without_joints_rests() -> None:
-    b = mounted("rock", "rock", "glue", "fixed", mass=1.0)
-    model: Model = b.build()
-    found = reference(model, [], [], 1.0, [0, 1.0])
-    assert isinstance(found, Reference)
-    assert found.q.shape == (2, 0)
 
 
 def test_a_reference_without_a_witness_says_why(monkeypatch):

@@ -194,16 +194,6 @@ def test_with_a_joint_type_of_ones_own() -> None:
     assert close(Y @ pi, dyn.inverse_dynamics(q, v, a), np.abs(Y) @ np.abs(pi))
 
 
-def test_one_state_a_batch_and_none() -> None:
-    model = mb.load("ur5")
-    dyn = mb.dynamics(model, "lagrangian")
-    q, v, a, _ = states(model, 3)
-    many = dyn.regressor(q, v, a, "base")
-    assert np.array_equal(many[1], dyn.regressor(q[1], v[1], a[1], "base"))
-    assert dyn.regressor(q, v[0], a[0]).shape == (3, 6, 70)
-    assert dyn.regressor(q[:0], v[:0], a[:0], friction=True).shape == (0, 6, 82)
-
-
 def test_bad_arguments() -> None:
     model = mb.catalog.pendulum()
     dyn = mb.dynamics(model, "lagrangian")

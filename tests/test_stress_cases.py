@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import pickle
 import warnings
 
 import numpy as np
@@ -15,7 +14,7 @@ from mbkit.engines import dynamics
 from mbkit.engines.base import at_times
 from mbkit.errors import UnknownNameError
 from mbkit.model.validation import sample_mass_matrix
-from mbkit.simulate import METHODS, simulate
+from mbkit.simulate import simulate
 from mbkit.studies.motions import exact as exact_motions
 from mbkit.studies.motions.exact import cart_pole, precession
 from mbkit.studies.motions.reference import gap
@@ -56,19 +55,6 @@ def test_cases_go_by_name() -> None:
         "long",
     ]
     assert [c.family for c in ALL] == sorted((c.family for c in ALL), key=families.index)
-
-
-@pytest.mark.parametrize("case", ALL, ids=ids)
-def test_a_case_is_told_and_sent_to_other_processes(case: Case) -> None:
-    assert case.about[0].isupper()
-    assert case.about.endswith((".", "?"))
-    assert bool(case.bar) == bool(case.why)
-    assert set(case.quick) <= set(case.values)
-    for values in (case.values, case.quick):
-        assert len(values) >= 3
-        assert list(values) in (sorted(values), sorted(values, reverse=True))
-    assert set(case.methods) <= {*METHODS, "auto"}
-    assert pickle.loads(pickle.dumps(case)).facts() == case.facts()
 
 
 @pytest.mark.thorough(every=4)

@@ -7,7 +7,6 @@ import pytest
 import sympy as sp
 
 import mbkit as mb
-from mbkit.errors import InputError, UnknownNameError
 from mbkit.lagrangian import systems
 from tests.twins import CRANK, PISTON, TWINS, paper
 from validation import textbook
@@ -158,12 +157,3 @@ def test_every_system_reads_and_says_where_it_is_from(name):
     at |= {s: x or 0.3 for s, x in lag.parameters.items()} | ({lag.time: 0.1} if lag.time else {})
     defect = np.array((S + S.T).subs(at).evalf(), dtype=float)
     assert np.abs(defect).max() < 1e-13 * max(1.0, np.abs(np.array(rate.subs(at).evalf(), dtype=float)).max())
-
-
-def test_bad_input():
-    with pytest.raises(UnknownNameError, match="'kepler'"):
-        systems.get("keplr")
-    with pytest.raises(InputError, match="mass"):
-        systems.pendulum(mass=-1.0)
-    lag = systems.pendulum(mass=None)
-    assert lag.dynamics(options=INTERPRETED, m=2.0).mass_matrix([0.0])[0, 0] == 2.0

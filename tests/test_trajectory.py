@@ -210,32 +210,6 @@ def test_momentum_of_one_body_is_m_v_and_i_w() -> None:
     assert run.momentum()[0] == pytest.approx(np.concatenate([p, L]), abs=1e-14)
 
 
-@pytest.mark.parametrize("engine", ["pinocchio", "lagrangian"])
-def test_frames_with_a_bodys_name_do_not_mislead(engine: str) -> None:
-    def model(name: str) -> Model:
-        b = ModelBuilder("arm")
-        b.add_body("link", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.2, 0.15))
-        b.add_joint("hinge", "revolute", parent="world", child="link", axis=(0, 1, 0))
-        b.add_frame(name, body="link", translation=(0.3, 0.2, 0.1), rpy=(0.4, 0.5, 0.6))
-        return b.build()
-
-    runs = [simulate(dynamics(model(name), engine), [0.4], [2.0], 0.0) for name in ("link", "other")]
-    assert runs[0].momentum() == pytest.approx(runs[1].momentum(), abs=1e-15)
-
-
-def test_a_heavy_top_keeps_its_vertical_angular_momentum_and_a_cart_pole_its_p() -> None:
-    top = catalog.heavy_top()
-    run = simulate(dynamics(top), top.neutral(), [0.0, 150.0, -4.61538], 0.2, "dop853", rtol=1e-12)
-    L = run.momentum()[:, 3:]
-    assert np.abs(L[:, 2] - L[0, 2]).max() < 1e-9 * np.abs(L).max()
-    assert np.abs(L[:, 0] - L[0, 0]).max() > 1e-2 * np.abs(L).max()
-    cart = simulate(dynamics(catalog.cart_pole()), [0.0, 1.0], [0.5, 0.0], 1.0, "dop853", rtol=1e-12)
-    p = cart.canonical_momentum()
-    assert np.ptp(p[:, 0]) < 1e-10
-    assert p[:, 0] == pytest.approx(cart.momentum()[:, 0], abs=1e-13)
-    assert np.ptp(p[:, 1]) > 1.0
-
-
 def test_trajectories_with_parameters_of_their_own() -> None:
     model = catalog.double_pendulum(mass1=mb.Parameter("m1", 1.0), length2=mb.Parameter("l2", 1.0))
     dyn = dynamics(model, "lagrangian")
@@ -375,28 +349,6 @@ def test_a_picture_has_as_many_figures_as_asked(count: int) -> None:
     assert len(times(swing(method="dop853", rtol=1e-3).picture(count))) == count, "also between the states"
 
 
-@pytest.mark.thorough
-def test_pictures_of_everything(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    models = [
-        catalog.pendulum(),
-        catalog.cart_pole(),
-        catalog.chain(n=4),
-        catalog.heavy_top(),
-        catalog.free_body(),
-        random_tree(0, 10),
-        random_tree(1, 10, gravity=False, mimic=True),
-        free_tree(2),
-        mb.load("panda", mimic="free"),
-        mb.load("anymal_b", floating_base=True),
-    ]
-    for model in models:
-        q, v = model.random_state(rng)
-        figure = simulate(dynamics(model), q, v, 0.02, dt=0.005).picture(3)
-        assert figure.axes[0].get_aspect() == 1
-        figure.savefig(tmp_path / "strip.png", dpi=40)
-
-
 def test_the_plane_is_the_motions_or_the_one_asked_for() -> None:
     def told(run: Trajectory, **options: Any) -> str:
         return str(run.picture(2, **options).axes[0].texts[-1].get_text())
@@ -446,15 +398,6 @@ def test_skeletons_stand_where_engines_put_them(seed: int) -> None:
         for place in places:
             pool = np.concatenate([points, drawn.carts])
             assert np.abs(pool - place).max(axis=(1, 2)).min() < 1e-13
-
-
-def test_dir_holds_what_a_reader_looks_for() -> None:
-    assert {name for name in dir(swing()) if not name.startswith("_")} == {
-        *("t", "q", "v", "model", "method", "engine", "stats", "events"),
-        *("energy", "kinetic_energy", "potential_energy", "tau", "wrenches", "work", "power_balance"),
-        *("momentum", "canonical_momentum", "plot", "picture", "animate", "to_csv", "check", "driven"),
-        *("to_dataframe", "save", "load"),
-    }
 
 
 def driven(batch: bool) -> Trajectory:
