@@ -15,7 +15,7 @@ from mbkit.report import terminal
 from mbkit.report.page import render
 from mbkit.studies.measurement import Measurement
 from mbkit.studies.stress.figure import SHADES, cell_text, figure, number_text, shade, stable_steps
-from mbkit.studies.stress.measurements import CaseResult, Overview, Row, name_of, overviews, place
+from mbkit.studies.stress.measurements import CaseResult, Overview, Row, fractional_index, name_of, overviews
 from mbkit.studies.stress.result import StressResult
 from mbkit.studies.stress.view import against_theory, avoid, content, map_cells, methods, rules, steps
 
@@ -229,12 +229,12 @@ def test_an_engine_is_judged_by_its_furthest_method_but_by_the_first_of_its_term
     ],
 )
 def test_a_number_has_its_place_among_the_values_by_decades_in_either_direction(values, x, where):
-    assert place(values, x) == pytest.approx(where)
+    assert fractional_index(values, x) == pytest.approx(where)
 
 
 def test_what_is_in_no_order_has_no_places():
-    assert all(math.isnan(place(v, 1.0)) for v in ((), (1.0, 5.0, 2.0), (1.0, 1.0), (NAN, 1.0)))
-    assert math.isnan(place((1.0, 2.0), NAN))
+    assert all(math.isnan(fractional_index(v, 1.0)) for v in ((), (1.0, 5.0, 2.0), (1.0, 1.0), (NAN, 1.0)))
+    assert math.isnan(fractional_index((1.0, 2.0), NAN))
 
 
 def test_numbers_are_as_short_as_a_cell():

@@ -589,6 +589,34 @@ def test_the_order_is_taken_between_coarse_steps_and_rounding():
     assert observed_order(h[::-1], clean[::-1], floor=0, motion=1.0).order == pytest.approx(4)
 
 
+def test_what_is_asymptotic_is_what_the_page_says():
+    """Errors from 100 floors to 3 % of the motion, and slopes within 0.3 of each other, no more and no fewer."""
+    h = 0.1 / 2.0 ** np.arange(8)
+    # Errors 2^-4 apart: the least is 150 floors, the next below it would be 9.
+    e = 0.02 * 16.0 ** -np.arange(8.0)
+    assert observed_order(h, e, floor=e[-1] / 150, motion=1.0).points == 8
+    assert observed_order(h, e, floor=e[-1] / 80, motion=1.0).points == 7
+    # Of a motion of 0.5 m an error of 0.02 is more than 3 %, and one of 0.125 is of another order.
+    assert observed_order(h, e, floor=0.0, motion=0.5).points == 7
+    assert observed_order(h, e * np.where(h == h[0], 5, 1), floor=0.0, motion=1.0) == pytest.approx((4, 7))
+    # Every other step has a larger error: slopes differ by twice log2 of the factor.
+    for factor, points in ((1.08, 8), (1.3, 0)):
+        found = observed_order(h, e * np.where(np.arange(8) % 2, factor, 1.0), floor=0.0, motion=1.0)
+        assert found.points == points, factor
+
+
+@pytest.mark.parametrize(("factor", "turned"), [(0.9, False), (1.3, False), (1.7, True), (5.0, True)])
+def test_rounding_that_grows_by_half_turns_a_curve(factor, turned):
+    points = tuple(
+        Measurement(h, error=e, setting="dt") for h, e in ((0.1, 1e-3), (0.05, 1e-6), (0.025, factor * 1e-6))
+    )
+    curve = Curve("newton", "rk4", points, 4.0, 3, 4.0, 0.0)
+    assert curve.turn == (points[1] if turned else None)
+    assert dataclasses.replace(curve, points=points[:2]).turn is None
+    by_tolerance = tuple(dataclasses.replace(p, setting="rtol") for p in points)
+    assert dataclasses.replace(curve, points=by_tolerance).turn is None
+
+
 @given(order=st.integers(1, 8), size=st.floats(1e-6, 1e-2), lost=st.integers(0, 4))
 def test_a_pure_power_shows_itself_whatever_is_missing(order, size, lost):
     h = 0.1 / 2.0 ** np.arange(8)

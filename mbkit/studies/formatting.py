@@ -45,14 +45,14 @@ def count_text(x: float) -> str:
     return "" if math.isnan(x) else "∞" if math.isinf(x) else f"{x:.3g}" if abs(x) < 1000 else f"{x:.1e}"
 
 
-def mark(passed: bool | None, text: str) -> Span:
+def judged(passed: bool | None, text: str) -> Span:
     """Return a text with ✓ or ✗ before it; with a dash where nothing was judged."""
     if passed is None:
         return Span(f"– {text:>7}", "muted")
     return Span(f"✓ {text:>7}", "good") if passed else Span(f"✗ {text:>7}", "bad")
 
 
-def choice(value: Any) -> str:
+def setting_words(value: Any) -> str:
     """Return a setting (a switch, a number, a text or several of them) as a person writes it."""
     if value is None:
         return "–"
@@ -61,11 +61,11 @@ def choice(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.12g}"
     if isinstance(value, Mapping):
-        return "; ".join(f"{k}: {choice(x)}" for k, x in value.items())
-    return ", ".join(map(choice, value)) if isinstance(value, (list, tuple)) else str(value)
+        return "; ".join(f"{k}: {setting_words(x)}" for k, x in value.items())
+    return ", ".join(map(setting_words, value)) if isinstance(value, (list, tuple)) else str(value)
 
 
-def brief(missing: Iterable[str]) -> str:
+def missing_text(missing: Iterable[str]) -> str:
     """Return what a study left out, to follow a sentence; of long lists their number alone, as they stand below."""
     return "".join(f"; {x if len(x) <= _MAX_LISTED_LETTERS else x.rpartition(':')[0] or x}" for x in missing)
 

@@ -44,6 +44,11 @@ class Refusal:
     term: str
     reason: str
 
+    @property
+    def name(self) -> str:
+        """Engine and term."""
+        return f"{self.engine} {self.term}".strip()
+
     @classmethod
     def of(cls, engine: str, error: Exception, term: str = "") -> Refusal:
         """Return an error as a refusal, whose reason does not name the engine again."""

@@ -46,15 +46,18 @@ def page_style(salt: str) -> Iterator[None]:
 
 @contextmanager
 def canvas(
-    salt: str, width: float, height: float, rows: int = 1, columns: int = 1, **grid: Any
+    salt: str, height: float, width: float = PAGE_WIDTH_INCHES, panels: int = 1, columns: int = 1, **grid: Any
 ) -> Iterator[tuple[Figure, list[Axes]]]:
-    """Give a figure, sized in inches, and its axes, row by row."""
+    """Give a figure, sized in inches, and the axes of so many panels, row by row."""
     # Figure without pyplot: no window system, nothing to close.
     from matplotlib.figure import Figure
 
     with page_style(salt):
         fig = Figure(figsize=(width, height))
-        yield fig, list(fig.subplots(rows, columns, squeeze=False, **grid).flat)
+        axes = list(fig.subplots(math.ceil(panels / columns), columns, squeeze=False, **grid).flat)
+        for ax in axes[panels:]:
+            ax.remove()
+        yield fig, axes[:panels]
 
 
 def svg(fig: Figure, title: str) -> str:

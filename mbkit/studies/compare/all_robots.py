@@ -160,7 +160,7 @@ def drawn_robots(result: Sweep) -> str:
         if (worst := c.worst) is not None:
             text = f"{robot}: {error_text(worst.relative)}, {worst.term} of {worst.engine}"
             groups.setdefault(c.engines, []).append((int(c.facts["nv"]), shown_error(worst.relative, 1e-17), text))
-    with canvas("robots", 7.2, 3.4) as (fig, (ax,)):
+    with canvas("robots", 3.4, 7.2) as (fig, (ax,)):
         for k, (engines, points) in enumerate(groups.items()):
             nv, errors, texts = zip(*points, strict=True)
             look: dict[str, Any] = {"color": PAGE.series[k % 6], "label": ", ".join(engines)}
@@ -231,7 +231,7 @@ def outcome_of(
             file = find(name)
             return RobotOutcome(name, "refused", str(error).removeprefix(f"{file.path}: " if file else ""))
         result = compare(model, engines, samples, seed, terms_only=True)
-    reasons = (f"{r.engine}{' ' + r.term if r.term else ''}: {r.reason}" for r in result.refusals)
+    reasons = (f"{r.name}: {r.reason}" for r in result.refusals)
     refused = "; ".join(dict.fromkeys(reasons))
     if result.nothing:
         return RobotOutcome(name, "refused", refused or result.verdict, result)

@@ -20,7 +20,7 @@ from mbkit.simulate.plotting.style import (
 )
 from mbkit.studies.compare.rows import Row, by_term
 from mbkit.studies.formatting import error_text, time_text
-from mbkit.studies.svg import PAGE, PAGE_WIDTH_INCHES, canvas, page_legend, page_style, svg
+from mbkit.studies.svg import PAGE, canvas, page_legend, page_style, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -119,15 +119,14 @@ def term_costs(rows: Sequence[Row], engines: Sequence[str], tolerance: float) ->
     terms = list(dict.fromkeys(r.term for r in timed))
     if not terms:
         return ""
-    count = math.ceil(len(terms) / _PANELS_PER_ROW)
-    height = 1.0 + 1.55 * count
+    height = 1.0 + 1.55 * math.ceil(len(terms) / _PANELS_PER_ROW)
     margins = {"left": 0.07, "right": 0.995, "top": 1 - 0.6 / height, "bottom": 0.5 / height}
     grid = {**margins, "wspace": 0.15, "hspace": 0.3}
-    shared = {"sharex": True, "sharey": True, "gridspec_kw": grid}
-    with canvas("term costs", PAGE_WIDTH_INCHES, height, count, _PANELS_PER_ROW, **shared) as (fig, panels):
+    shape: dict[str, Any] = {"panels": len(terms), "columns": _PANELS_PER_ROW, "sharex": True, "sharey": True}
+    with canvas("term costs", height, **shape, gridspec_kw=grid) as (fig, panels):
         level: dict[str, Any] = {"color": PAGE.muted, "linewidth": 0.9}
         dashed = {**level, "linestyle": (0, (4, 3))}
-        for ax, term in zip(panels, terms, strict=False):
+        for ax, term in zip(panels, terms, strict=True):
             ax.axhline(_EPS, **level)
             ax.axhline(tolerance, **dashed)
             for row in timed:
@@ -145,9 +144,6 @@ def term_costs(rows: Sequence[Row], engines: Sequence[str], tolerance: float) ->
         panels[0].set_xlim(min(times) / 1.6, max(times) * 1.6)
         panels[0].set_ylim(min(*errors, _EPS) / 3, max(*errors, tolerance) * 3)
         for k, ax in enumerate(panels):
-            if k >= len(terms):
-                ax.remove()
-                continue
             ax.grid(which="major")
             log_ticks(ax, 5)
             ax.tick_params(labelsize=8.5, labelbottom=k + _PANELS_PER_ROW >= len(terms))

@@ -16,7 +16,7 @@ from mbkit.studies import document as doc
 from mbkit.studies.compare import figure, tables
 from mbkit.studies.compare.errors import named_precision
 from mbkit.studies.compare.rows import OWN_LAW, STIFF, Finding, Omission, RolloutRow, Row, by_term
-from mbkit.studies.formatting import brief, model_facts, refusals, time_text
+from mbkit.studies.formatting import missing_text, model_facts, refusals, time_text
 from mbkit.studies.results import Refusal, ResultTable, columns_of
 from mbkit.studies.work_precision.result import WorkPrecision, curve_sections, failed_curves
 
@@ -218,7 +218,7 @@ class Comparison(ResultTable):
         known = [r.engine for r in rows if r.defect]
         by_defect = f" ({len(known)} by a known defect of {', '.join(dict.fromkeys(known))})" if known else ""
         subject = f"{', '.join(engines)} differ{'s' * (len(engines) == 1)}: " if engines else ""
-        return f"{subject}{', '.join(parts)}{by_defect}{brief(self.shortened)}"
+        return f"{subject}{', '.join(parts)}{by_defect}{missing_text(self.shortened)}"
 
     def _sentence(self) -> str:
         """Return the headline, with what was compared with what on how many states."""
@@ -231,7 +231,7 @@ class Comparison(ResultTable):
         measured = f"{terms} term{'s' * (terms != 1)} at {self.rows[0].samples} states"
         if not self.passed:
             return f"{self.headline}; measured against {reference}, in {measured}"
-        return f"{self.agreement(f' with {reference}')}, in {measured}{brief(self.shortened)}"
+        return f"{self.agreement(f' with {reference}')}, in {measured}{missing_text(self.shortened)}"
 
     def document(self, target: str = "", *, full: bool = True) -> doc.Document:
         """Return the document of the comparison; `target` is the name by which a person called the model.

@@ -8,7 +8,7 @@ from typing import Any, Final, Literal
 
 from mbkit.studies import document as doc
 from mbkit.studies.compare.rows import Omission, RolloutRow, Row
-from mbkit.studies.formatting import count_text, error_text, mark, time_text
+from mbkit.studies.formatting import count_text, error_text, judged, time_text
 
 #: The least relative change of accelerations that is an effect: rounding stays far below it.
 _MIN_VISIBLE_CHANGE: Final = 1e-6
@@ -74,7 +74,7 @@ def _error(row: Row) -> doc.Span:
         return doc.Span(f"– {'zero':>7}", "muted")
     if row.passed and row.reason:
         return doc.Span(f"! {error_text(row.relative):>7}", "allowed")
-    return mark(row.passed, error_text(row.relative))
+    return judged(row.passed, error_text(row.relative))
 
 
 WORST: Final = (
@@ -147,7 +147,7 @@ def rollout_blocks(rollouts: Sequence[RolloutRow]) -> list[doc.Block]:
         doc.Column("step", lambda r: time_text(r.dt), right=True, on="page"),
         doc.Column("horizon", lambda r: time_text(r.duration), right=True),
         doc.Column("condition", lambda r: count_text(r.condition), right=True),
-        doc.Column("difference", lambda r: mark(r.passed, error_text(r.error)), right=True),
+        doc.Column("difference", lambda r: judged(r.passed, error_text(r.error)), right=True),
         doc.Column("tolerance", lambda r: f"{r.tolerance:.2g}", right=True, on="page"),
         doc.Column("run time", lambda r: time_text(r.seconds), right=True),
         doc.Column("MuJoCo's", lambda r: time_text(r.seconds_against), right=True),
@@ -198,7 +198,7 @@ def _saving(omission: Omission) -> doc.Span:
 
 def _change(omission: Omission) -> doc.Text:
     state, text = omission_state(omission), error_text(omission.change)
-    return "–" if state == "on" else text if state == "chosen" else mark(state == "same", text)
+    return "–" if state == "on" else text if state == "chosen" else judged(state == "same", text)
 
 
 def omission_blocks(omissions: Sequence[Omission]) -> list[doc.Block]:

@@ -52,17 +52,20 @@ from mbkit.studies.study_runs import Deadline, TooLongError, quiet_simulate
 # Pairs of runs of one motion: their difference bounds the error of either.
 
 # Parts of the motion that two engines run by turns, so that they stop soon after they part.
-_MAX_LEGS: Final = 20
+_MAX_STRETCHES: Final = 20
 # The second Taylor run's tolerance over the first one's: one order less, so other steps, rounding and truncation.
 _SECOND_TOLERANCE_RATIO: Final = 8.0
-#: Engine and method of each of two independent roads, best first; and of roads that stiff motion does not make long.
-_Roads = tuple[tuple[tuple[str, str], ...], ...]
-_ROADS: Final[_Roads] = (
+#: Engines and methods of each of two independent runs, best first: all, the quick ones, and those for stiff motion.
+_EngineChoices = tuple[tuple[tuple[str, str], ...], ...]
+_INDEPENDENT_CHOICES: Final[_EngineChoices] = (
     tuple((DERIVED, method) for method in (SERIES_METHOD, ADAPTIVE_METHOD, SCIPY_METHOD)),
     tuple((engine, SCIPY_METHOD) for engine in INDEPENDENT),
 )
-_QUICK: Final[_Roads] = (_ROADS[0][1:], _ROADS[1])
-_STIFF: Final[_Roads] = (((DERIVED, STIFF_METHOD),), tuple((engine, SCIPY_STIFF_METHOD) for engine in INDEPENDENT))
+_QUICK_CHOICES: Final[_EngineChoices] = (_INDEPENDENT_CHOICES[0][1:], _INDEPENDENT_CHOICES[1])
+_STIFF_CHOICES: Final[_EngineChoices] = (
+    ((DERIVED, STIFF_METHOD),),
+    tuple((engine, SCIPY_STIFF_METHOD) for engine in INDEPENDENT),
+)
 #: The largest difference of two runs that agree, relative to the size of the motion.
 MAX_RELATIVE_GAP: Final = 1e-12
 # Two runs that are farther apart than this, rad or m, have parted for good.
@@ -133,7 +136,7 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Known:
+class RunPair:
     """The states of a pair of runs, at the times that both reached: (high, low) parts of (K, nq) and (K, nv) arrays."""
 
     q: tuple[Array, Array]
@@ -163,7 +166,7 @@ def gap(model: Model, a: Any, b: Any) -> Array:
     return np.asarray(np.abs(apart).max(axis=1, initial=0.0))
 
 
-def taylor_pair(motion: Motion, deadline: Deadline, bits: int) -> Known:
+def taylor_pair(motion: Motion, deadline: Deadline, bits: int) -> RunPair:
     """Return two Taylor runs at different orders, in a format of so many bits, from exactly the doubles of the model.
 
     `UnsupportedError` without heyoka or this format, and for a model too large.
@@ -192,7 +195,7 @@ def taylor_pair(motion: Motion, deadline: Deadline, bits: int) -> Known:
     apart = [np.maximum(gap(model, first[:, :nq], second[:, :nq]), opened), _largest(first[:, nq:] - second[:, nq:])]
     orders = " and ".join(str(order_of(x)) for x in tolerances)
     how = f"Taylor series of orders {orders} in {PRECISIONS[bits]} numbers on the own derivation"
-    return Known(q, v, np.array(apart), how, why, steps, shared=True)
+    return RunPair(q, v, np.array(apart), how, why, steps, shared=True)
 
 
 def _states(motion: Motion, kind: Any, steps: TaylorSteps, deadline: Deadline, most: int) -> tuple[list[Any], int, str]:
@@ -228,42 +231,46 @@ def _largest(x: Any) -> Array:
 
 
 def two_engines(
-    motion: Motion, deadline: Deadline, choices: _Roads = _ROADS, rtol: float = 0.0, parted: float = _PARTED_GAP
-) -> Known:
+    motion: Motion,
+    deadline: Deadline,
+    choices: _EngineChoices = _INDEPENDENT_CHOICES,
+    rtol: float = 0.0,
+    parted: float = _PARTED_GAP,
+) -> RunPair:
     """Return runs of two engines, each with a method of its own, marching by turns until they part.
 
     Their tolerance is the least that the methods take, or `rtol`.
     """
     with deadline.paused():
-        roads = [_road(motion, several) for several in choices]
-    how = " and ".join(f"{method} on {dyn.engine}" for dyn, method in roads)
-    states = [(motion.q0[None], motion.v0[None]) for _ in roads]
+        chosen = [_available_choice(motion, several) for several in choices]
+    how = " and ".join(f"{method} on {dyn.engine}" for dyn, method in chosen)
+    states = [(motion.q0[None], motion.v0[None]) for _ in chosen]
     times, why = motion.save, ""
-    ends = np.unique(np.linspace(0, len(times) - 1, min(_MAX_LEGS, len(times) - 1) + 1).astype(int))
+    ends = np.unique(np.linspace(0, len(times) - 1, min(_MAX_STRETCHES, len(times) - 1) + 1).astype(int))
     for k, end in pairwise(ends.tolist()):
-        legs: list[Trajectory] = []
+        stretches: list[Trajectory] = []
         try:
-            for (dyn, method), (q, v) in zip(roads, states, strict=True):
-                legs.append(_leg(motion, dyn, method, rtol, q[-1], v[-1], slice(k, end + 1), deadline))
-                if not legs[-1].stats.finished:
+            for (dyn, method), (q, v) in zip(chosen, states, strict=True):
+                stretches.append(_stretch(motion, dyn, method, rtol, q[-1], v[-1], slice(k, end + 1), deadline))
+                if not stretches[-1].stats.finished:
                     why = f"{method} on {dyn.engine} ended early, within {times[k]:.6g} to {times[end]:.6g} s"
         except TooLongError:
             why = f"the seconds allowed for it were used up after t = {times[k]:.6g} s"
             break
-        n = min(len(leg.t) for leg in legs)
+        n = min(len(stretch.t) for stretch in stretches)
         states = [
-            (np.concatenate([q, leg.q[1:n]]), np.concatenate([v, leg.v[1:n]]))
-            for (q, v), leg in zip(states, legs, strict=True)
+            (np.concatenate([q, stretch.q[1:n]]), np.concatenate([v, stretch.v[1:n]]))
+            for (q, v), stretch in zip(states, stretches, strict=True)
         ]
         # Runs that have parted for good need not be followed to the end.
         if why or gap(motion.model, states[0][0][-1:], states[1][0][-1:])[0] > parted:
             break
     (q, v), (other_q, other_v) = states
     apart = np.array([gap(motion.model, q, other_q), _largest(v - other_v)])
-    return Known((q, np.zeros_like(q)), (v, np.zeros_like(v)), apart, how, why)
+    return RunPair((q, np.zeros_like(q)), (v, np.zeros_like(v)), apart, how, why)
 
 
-def _road(motion: Motion, choices: tuple[tuple[str, str], ...]) -> tuple[Dynamics, str]:
+def _available_choice(motion: Motion, choices: tuple[tuple[str, str], ...]) -> tuple[Dynamics, str]:
     reasons = []
     for engine, method in choices:
         try:
@@ -286,7 +293,7 @@ def _require_rigid(dyn: Dynamics) -> None:
         raise UnsupportedError(f"{dyn.engine} holds loops softly")
 
 
-def _leg(
+def _stretch(
     motion: Motion, dyn: Dynamics, method: str, rtol: float, q: Array, v: Array, rows: slice, deadline: Deadline
 ) -> Trajectory:
     """Return the motion between two of the saved times."""
@@ -309,7 +316,7 @@ _TYPICAL_STEPS_PER_SECOND: Final = 40.0
 # count.
 _MIN_SERIES_SECONDS: Final = 5.0
 # The largest number of states at which accelerations are compared.
-_MAX_WITNESSED_STATES: Final = 64
+_MAX_COMPARED_STATES: Final = 64
 # The relative resolution of a pair of doubles: 106 bits of a number that can be somewhat larger than the motion.
 _PAIR_RESOLUTION: Final = 2.0**-105
 _EPS: Final = float(np.finfo(np.float64).eps)
@@ -438,7 +445,7 @@ def reference(
     # The one that holds longest, and of those the best.
     cut = ((_cut(motion, known, agree), known) for known in pairs)
     best, known = max(cut, key=lambda pair: (pair[0].horizon, pair[0].digits))
-    return replace(best, how=best.how + _witness(motion, best)) if known.shared else best
+    return replace(best, how=best.how + _accelerations_text(motion, best)) if known.shared else best
 
 
 def checked_motion(
@@ -470,8 +477,8 @@ def _at_rest(motion: Motion) -> Reference:
 
 def _search(
     motion: Motion, deadline: Deadline, seconds: float, wanted: float, agree: float
-) -> tuple[list[Known], list[str]]:
-    pairs: list[Known] = []
+) -> tuple[list[RunPair], list[str]]:
+    pairs: list[RunPair] = []
     refused: list[str] = []
 
     def holds(way: Any, *more: Any, within: float = inf) -> bool:
@@ -484,8 +491,11 @@ def _search(
         return bool(_cut(motion, pairs[-1], wanted).horizon == motion.save[-1])
 
     if wanted > MAX_RELATIVE_GAP:
-        for roads, rtol, part in ((_QUICK, 0.0, 0.25), (_STIFF, _STIFF_TOLERANCE_PART * wanted, 0.75)):
-            if holds(two_engines, roads, rtol, max(agree, _PARTED_GAP), within=part * deadline.left):
+        for choices, rtol, part in (
+            (_QUICK_CHOICES, 0.0, 0.25),
+            (_STIFF_CHOICES, _STIFF_TOLERANCE_PART * wanted, 0.75),
+        ):
+            if holds(two_engines, choices, rtol, max(agree, _PARTED_GAP), within=part * deadline.left):
                 return pairs, refused
         if deadline.left < _MIN_SERIES_SECONDS:
             return pairs, refused
@@ -514,7 +524,7 @@ def _quadruple_seconds(motion: Motion, steps: float) -> float:
     return 2 * steps * operations * order**2 * _SECONDS_PER_QUADRUPLE_OPERATION
 
 
-def _cut(motion: Motion, known: Known, agree: float) -> Reference:
+def _cut(motion: Motion, known: RunPair, agree: float) -> Reference:
     """Return the reference from a pair of runs, up to where they part."""
     model, (q, q_low), (v, v_low) = motion.model, known.q, known.v
     moved = gap(model, q, np.broadcast_to(q[:1], q.shape))
@@ -549,9 +559,9 @@ def _cut(motion: Motion, known: Known, agree: float) -> Reference:
 _MAX_REASON_LETTERS: Final = 120
 
 
-def _witness(motion: Motion, best: Reference) -> str:
+def _accelerations_text(motion: Motion, best: Reference) -> str:
     """Return a text that compares accelerations along a motion with those of another engine."""
-    which = np.unique(np.linspace(0, len(best.t) - 1, min(_MAX_WITNESSED_STATES, len(best.t))).astype(int))
+    which = np.unique(np.linspace(0, len(best.t) - 1, min(_MAX_COMPARED_STATES, len(best.t))).astype(int))
     q, v = best.q[which], best.v[which]
     force, last = motion.torque.of_member(None), max(len(motion.stops) - 1, 0)
     tau = np.array([force(min(int(k), last)) for k in which])

@@ -27,7 +27,7 @@ from mbkit.simulate.plotting.style import (
     name_points,
 )
 from mbkit.studies.measurement import Measurement, Outcome
-from mbkit.studies.stress.measurements import CaseResult, Line, Overview, engines_of, name_of, place
+from mbkit.studies.stress.measurements import CaseResult, Line, Overview, engines_of, fractional_index, name_of
 from mbkit.studies.svg import PAGE, PAGE_WIDTH_INCHES, canvas, page_legend, svg
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ def _map(case: CaseResult, palette: Palette, given: Axes | None) -> Figure:
         if line.broken.failed is not None:
             ax.plot([line.reach - 0.5] * 2, ends, color=palette.ink, linewidth=2.2, solid_capstyle="butt")
         # Before the first value beyond what linear theory allows.
-        at = math.nan if line.row.theory is None else place(case.values, line.row.theory)
+        at = math.nan if line.row.theory is None else fractional_index(case.values, line.row.theory)
         if at < count - 1:
             ax.plot([math.floor(at) + 0.5] * 2, ends, color=palette.series[3], linewidth=2.0, linestyle=_DASHED)
     ax.set_xlim(-0.5, max(count, 1) - 0.5)
@@ -243,19 +243,14 @@ def stable_steps(cases: Sequence[tuple[CaseResult, Sequence[Line]]]) -> str:
     rows.sort(key=lambda row: (methods.index(row.method), engine_index(row.engine)))
     names = list(dict.fromkeys(map(name_of, rows)))
     columns = min(_PANELS_PER_ROW, len(cases))
-    count = math.ceil(len(cases) / columns)
     panel = 0.2 * len(names)
-    height = 0.4 + (panel + 0.75) * count
+    height = 0.4 + (panel + 0.75) * math.ceil(len(cases) / columns)
     margins = {"left": 0.2, "right": 0.99, "top": 1 - 0.75 / height, "bottom": 0.5 / height}
     grid = {**margins, "wspace": 0.06, "hspace": 0.75 / panel}
-    with canvas("stable steps", PAGE_WIDTH_INCHES, height, count, columns, sharey=True, gridspec_kw=grid) as (
-        fig,
-        panels,
-    ):
-        for ax, (case, lines) in zip(panels, cases, strict=False):
+    shape: dict[str, Any] = {"panels": len(cases), "columns": columns, "sharey": True, "gridspec_kw": grid}
+    with canvas("stable steps", height, **shape) as (fig, panels):
+        for ax, (case, lines) in zip(panels, cases, strict=True):
             _step_panel(ax, case, lines, names)
-        for ax in panels[len(cases) :]:
-            ax.remove()
         engines = sorted({row.engine for row in rows}, key=engine_index)
         page_legend(fig, engines, [{**_THEORY, "label": "linear theory"}], 0.0, 6.0)
         return svg(fig, "Largest stable step of each method")

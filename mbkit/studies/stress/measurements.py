@@ -250,7 +250,7 @@ def engines_of(cases: Iterable[CaseResult]) -> list[str]:
     return sorted(dict.fromkeys(row.engine for case in cases for row in case.rows), key=engine_index)
 
 
-def place(values: Sequence[float], x: float) -> float:
+def fractional_index(values: Sequence[float], x: float) -> float:
     """Return where a number stands among a sweep's values, as a fractional index; decades are even if all are positive.
 
     -1 and the number of values stand for places beyond the ends; NaN for NaN, and for unordered values.

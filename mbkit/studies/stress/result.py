@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 from mbkit._check import real
 from mbkit.errors import require_known
 from mbkit.studies.document import Bullet, Column, Document, Items, Paragraph, Section, Span, Table
-from mbkit.studies.formatting import choice, time_text
+from mbkit.studies.formatting import setting_words, time_text
 from mbkit.studies.measurement import Measurement, Outcome
 from mbkit.studies.results import NO_LIMIT, ResultTable, columns, counted
 from mbkit.studies.stress.figure import figure
@@ -195,7 +195,7 @@ class StressResult(ResultTable):
             ],
             result=self,
             basis={
-                name: f"{value / 2**30:g} GiB" if name == "memory" and value else choice(value)
+                name: f"{value / 2**30:g} GiB" if name == "memory" and value else setting_words(value)
                 for name, value in self.settings.items()
             },
             template="stress.html",

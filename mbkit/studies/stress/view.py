@@ -17,7 +17,7 @@ from mbkit.studies.measurement import Measurement, Outcome
 from mbkit.studies.results import counted
 from mbkit.studies.stress.case import Family
 from mbkit.studies.stress.figure import MAX_ROOMY_COLUMNS, cell_text, error_short, number_text, shade, stable_steps
-from mbkit.studies.stress.measurements import CaseResult, Line, Overview, Row, engines_of, name_of, place
+from mbkit.studies.stress.measurements import CaseResult, Line, Overview, Row, engines_of, fractional_index, name_of
 
 #: Outcomes in words that follow "then".
 HOW: Final[dict[Outcome, str]] = {
@@ -289,7 +289,7 @@ def _least(group: list[Bound]) -> Bound:
 def against_theory(line: Line) -> str:
     """Return how the measured breaking point compares with linear theory; empty where one is unknown."""
     limit, failed, values = _limit(line), line.broken.failed, line.case.values
-    at = place(values, limit)
+    at = fractional_index(values, limit)
     if math.isnan(at):
         return ""
     if line.reach and at < line.reach - 1:
@@ -319,7 +319,7 @@ class MapCell(NamedTuple):
 def map_cells(line: Line) -> list[MapCell]:
     """Return a row of a case's map."""
     case = line.case
-    at = place(case.values, _limit(line))
+    at = fractional_index(case.values, _limit(line))
     beyond = -1 if math.isnan(at) else math.floor(at) + 1
     out = []
     for k, (cell, how) in enumerate(zip(line.row.cells, line.outcomes, strict=True)):

@@ -55,13 +55,12 @@ class Curve:
 
         So it is of an engine in single precision, whose error in the sum of steps is some eps / dt.
         """
-        known = [p for p in self.points if math.isfinite(p.error)]
-        best = min(known, key=lambda p: p.error, default=None)
-        finer = [] if best is None else [p for p in known if p.value < best.value]
-        worse = bool(finer) and all(
-            p.setting == "dt" and p.error > _MIN_TURNED_ERROR_RATIO * best.error for p in finer if best
-        )
-        return best if worse else None
+        fixed = [p for p in self.points if p.setting == "dt" and math.isfinite(p.error)]
+        if not fixed:
+            return None
+        best = min(fixed, key=lambda p: p.error)
+        finer = [p.error for p in fixed if p.value < best.value]
+        return best if finer and min(finer) > _MIN_TURNED_ERROR_RATIO * best.error else None
 
     def reach(self, error: float) -> Measurement | None:
         """Return the fastest point with at most this error, if there is one."""

@@ -20,6 +20,7 @@ from mbkit.simulate.plotting.style import (
     name_points,
 )
 from mbkit.studies.measurement import Measurement
+from mbkit.studies.svg import PAGE_WIDTH_INCHES
 from mbkit.studies.work_precision.curve import Curve, pareto_front
 
 if TYPE_CHECKING:
@@ -34,7 +35,6 @@ _Measure = Callable[[Measurement], float]
 #: MuJoCo's own integrators stand in the panel of the same formula.
 _SAME_FORMULA: Final = {m.name: m.own for m in METHODS.values() if m.own}
 _PANELS_PER_ROW: Final = 5
-_WIDTH_INCHES: Final = 10.4
 _TOP_HEIGHT_INCHES: Final = 4.4
 #: Right end of the axes; leaves room for half of the last tick's label.
 _RIGHT_EDGE: Final = 0.98
@@ -75,7 +75,7 @@ def figure(
             legend(only, _handles(curves, floor, palette), "lower", own=False, columns=2)
             return figure_of(only)
         height = _TOP_HEIGHT_INCHES + (0.75 + _PANEL_HEIGHT_INCHES * rows if rows else 0.0)
-        fig = Figure(figsize=(_WIDTH_INCHES, height))
+        fig = Figure(figsize=(PAGE_WIDTH_INCHES, height))
         split = 1 - _TOP_HEIGHT_INCHES / height
         # With dampers the energy is not conserved, and there is no drift to show.
         conserved = any(_drawable(p.seconds, p.energy) for c in curves for p in c.points)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 
 from mbkit._check import by_key
 from mbkit.studies import document as doc
-from mbkit.studies.formatting import brief, choice, count_text, error_text, model_facts, time_text
+from mbkit.studies.formatting import count_text, error_text, missing_text, model_facts, setting_words, time_text
 from mbkit.studies.measurement import Measurement
 from mbkit.studies.results import Refusal, ResultTable, columns, counted
 from mbkit.studies.study_runs import OUT_OF_TIME
@@ -147,7 +147,7 @@ class WorkPrecision(ResultTable):
         """What was taken out of the model, curves that failed or ran out of time, and a horizon that was cut."""
         out = [*self.settings.get("changed", ()), *([] if self.complete else ["interrupted"])]
         if failed := self.failed:
-            names = list(dict.fromkeys(f"{r.engine} {r.term}".strip() for r in failed))
+            names = list(dict.fromkeys(r.name for r in failed))
             out.append(f"{counted(len(names), 'curve')} left out: {', '.join(names)}")
         out += [self.bounded] if self.bounded else []
         ended = [f"{c.engine} {c.method}" for c in self.curves if c.ended]
@@ -198,7 +198,7 @@ class WorkPrecision(ResultTable):
         """Return the headline with what the errors are measured against; long lists stand below it."""
         known = f"known to {error_text(self.floor)} rad or m" if math.isfinite(self.floor) else "of unknown error"
         measured = f"errors of q over {self.duration:g} s, against a reference {known}"
-        return f"{self._fastest()}; {measured}{brief(x for x in self.shortened if x != 'interrupted')}"
+        return f"{self._fastest()}; {measured}{missing_text(x for x in self.shortened if x != 'interrupted')}"
 
     def _fastest(self) -> str:
         stopped = "" if self.complete else "interrupted; what was finished: "
@@ -233,7 +233,7 @@ class WorkPrecision(ResultTable):
                 ),
             ],
             result=self,
-            basis={name: choice(value) for name, value in self.settings.items()},
+            basis={name: setting_words(value) for name, value in self.settings.items()},
         )
 
     def plot(self, ax: Axes | None = None) -> Figure:
@@ -296,13 +296,13 @@ def picture(result: WorkPrecision) -> bytes:
 
 def failed_curves(failed: Sequence[Refusal]) -> list[doc.Bullet]:
     """Return the methods that gave no curve, those of one reason together."""
-    of = by_key((r.reason, f"{r.engine} {r.term}".strip()) for r in failed)
+    of = by_key((r.reason, r.name) for r in failed)
     return [doc.Bullet(", ".join(dict.fromkeys(names)), reason) for reason, names in of.items()]
 
 
 def curve_sections(result: WorkPrecision, whole: bool, on: doc.On = "both") -> list[doc.Section]:
     """Return the sections of a study, shown on `on`; unless `whole`, a terminal shows the fastest only."""
-    missing = brief(result.shortened).removeprefix("; ") if not whole else ""
+    missing = missing_text(result.shortened).removeprefix("; ") if not whole else ""
     cut = f", cut from {result.asked:g} s where the reference stops holding" if result.duration < result.asked else ""
     of = "rad or m (a smaller error of a run cannot be told)"
     known = (
@@ -317,7 +317,7 @@ def curve_sections(result: WorkPrecision, whole: bool, on: doc.On = "both") -> l
     drawn = doc.Figure(lambda: error_against_time(result), front.format(", ".join(front_names(result))), wide=True)
     fastest = leads(result)
     about = f"Error against run time, {result.duration:g} s of motion: errors of q in rad or m"
-    start = [(n, f"{n} = [{choice(getattr(result, n))}]") for n in ("q0", "v0")]
+    start = [(n, f"{n} = [{setting_words(getattr(result, n))}]") for n in ("q0", "v0")]
     lists: doc.On = on if whole else "page"
     return [
         doc.Section(

@@ -45,7 +45,6 @@ _EVALUATIONS_PER_PYTHON_CALL: Final = 8
 
 #: A run shorter than this is repeated within a round, s.
 _SHORT_RUN_SECONDS: Final = 2e-3
-_MAX_RUNS_IN_A_ROUND: Final = 100
 #: A sweep over the study's own grid ends after so many settings in a row that bring no smaller error.
 _MAX_SETTINGS_WITHOUT_GAIN: Final = 2
 #: A setting is finer if it takes at least so many times the steps: a decade of a tolerance is 1.33 at order 8.
@@ -333,7 +332,7 @@ class CurveMeasurement:
 
     def _repeat(self, one: _Run) -> None:
         assert self._dyn is not None
-        count = int(np.clip(_SHORT_RUN_SECONDS / max(one.first, 1e-9), 1, _MAX_RUNS_IN_A_ROUND))
+        count = max(1, int(_SHORT_RUN_SECONDS / one.first))
         begun = time.perf_counter()
         for _ in range(count):
             self._solve(self._dyn, one.value, self.truth.times)
