@@ -30,7 +30,14 @@ from mbkit.studies.compare import beyond_terms
 from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
 from mbkit.studies.compare.beyond_terms import rollouts
 from mbkit.studies.compare.body_terms import BODY_TERMS
-from mbkit.studies.compare.errors import Scales, acceleration_errors, force_errors, interleaved, matrix_errors
+from mbkit.studies.compare.errors import (
+    Scales,
+    acceleration_errors,
+    condition_under_constraints,
+    force_errors,
+    interleaved,
+    matrix_errors,
+)
 from mbkit.studies.compare.findings import findings
 from mbkit.studies.compare.terms import TERMS
 from mbkit.studies.compare.terms import states as study_states
@@ -762,3 +769,12 @@ def test_a_disc_that_lies_nearly_flat_rolls_with_all_digits() -> None:
     worst = next(row for row in result.rows if row.term == "J̇ v rows")
     assert worst.max_abs < 1e-10
     assert worst.relative < 1e-15
+
+
+@pytest.mark.parametrize(("ratio", "counts"), [(3e-11, True), (3e-12, False)])
+def test_rows_that_follow_from_others_have_no_condition(ratio, counts):
+    """Two rows at an angle d on two unit masses: the least eigenvalue of [[M, Jᵀ], [J, 0]] is d²/2, the largest 2."""
+    d = 2 * math.sqrt(ratio)
+    J = np.array([[[1.0, 0.0], [math.cos(d), math.sin(d)]]])
+    (condition,) = condition_under_constraints(np.eye(2)[None], J)
+    assert condition == pytest.approx(1 / ratio, rel=1e-3) if counts else condition < 10

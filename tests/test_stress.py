@@ -219,10 +219,28 @@ def test_nothing_is_lost_on_the_way_to_json_and_back(study):
             StressResult.from_json(text)
 
 
+@pytest.mark.parametrize(("rounding", "known"), [(3e-10, True), (3e-9, False)])
+def test_an_energy_that_is_only_rounding_is_no_energy(rounding, known):
+    """A mass falls from so high that 16 roundings of m g z are this part of what the energy changes by."""
+    b = mb.ModelBuilder("stone")
+    b.add_body("stone", mass=1.0)
+    b.add_joint("z", "prismatic", parent="world", child="stone", axis=(0.0, 0.0, 1.0))
+    model = b.build()
+    changed = 9.81**2 / 2
+    height = rounding * changed / (16 * np.finfo(float).eps * 9.81)
+    problem, dyn = Problem(model, np.array([height]), np.zeros(1)), mb.dynamics(model, "pinocchio")
+    times = np.array([0.0, 0.5, 1.0])
+    run = mb.simulate(dyn, problem.q, problem.v, 1.0, "rk4", 0.1, save=times)
+    cell = problem.measured(0.1, None, times, dyn, run)
+    assert (0 <= cell.energy < 1e-9) if known else math.isnan(cell.energy)
+
+
 def test_outcomes_by_error_floor_and_warning():
     assert Measurement(1.0, "finished", 1e-7).outcome(1e-6) == "held"
     assert Measurement(1.0, "finished", 1e-7, floor=9.5e-7).outcome(1e-6) == "unjudged"
-    assert Measurement(1.0, "finished", 0.5, floor=9.5e-7).outcome(1e-6) == "silent"
+    # Up to a hundredth of the motion it is inaccurate, beyond it wrong.
+    assert Measurement(1.0, "finished", 0.005).outcome(1e-6) == "inaccurate"
+    assert Measurement(1.0, "finished", 0.02, floor=9.5e-7).outcome(1e-6) == "silent"
     assert Measurement(1.0, "finished", 0.5, warnings=("beware",)).outcome(1e-6) == "warned"
     assert Measurement(1.0, "finished").outcome(1e-6) == "unjudged"
     assert Measurement(1.0, "finished", energy=1e-9).outcome(1e-6) == "unjudged"

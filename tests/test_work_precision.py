@@ -28,7 +28,7 @@ from mbkit.errors import InputError, MbkitWarning, UnknownNameError
 from mbkit.simulate import METHODS
 from mbkit.studies import InterruptedSweepError, Reference, work_precision
 from mbkit.studies.measurement import Measurement
-from mbkit.studies.work_precision.curve import Curve, observed_order
+from mbkit.studies.work_precision.curve import Curve, gains_nothing, observed_order
 from mbkit.studies.work_precision.result import WorkPrecision
 from mbkit.studies.work_precision.sweep import CurveMeasurement, _without_heyoka_cache, first_run, plans, repetitions
 from tests.scenes import chain, hinge, slider
@@ -603,6 +603,30 @@ def test_what_is_asymptotic_is_what_the_page_says():
     for factor, points in ((1.08, 8), (1.3, 0)):
         found = observed_order(h, e * np.where(np.arange(8) % 2, factor, 1.0), floor=0.0, motion=1.0)
         assert found.points == points, factor
+
+
+@pytest.mark.parametrize(
+    ("errors", "steps", "ends"),
+    [
+        # Two settings at rounding end a grid, and one does not.
+        ((1e-8, 0.9e-8, 1.1e-8), (100, 200, 400), True),
+        ((1e-8, 0.9e-8), (100, 200), False),
+        # Settings that hardly add a step tell nothing.
+        ((1e-8, 0.9e-8, 1.1e-8), (100, 105, 110), False),
+        # Errors of 3e-7 are at rounding; those of 3e-6 may still fall, unless they are all the same within 1 %.
+        ((3e-7, 3.3e-7, 2.9e-7), (100, 200, 400), True),
+        ((3e-6, 4e-6, 2.9e-6), (100, 200, 400), False),
+        ((1e-3, 1.004e-3, 0.999e-3), (100, 200, 400), True),
+        ((1e-3, 1.05e-3, 0.98e-3), (100, 200, 400), False),
+        # Below the reference's floor nothing is told, whatever the steps.
+        ((1e-9, 0.9e-13, 0.8e-13), (100, 101, 102), True),
+        ((1e-9, 1e-10, 1e-11), (100, 200, 400), False),
+        ((math.nan,), (0,), False),
+    ],
+)
+def test_a_grid_ends_where_the_last_settings_gain_nothing(errors, steps, ends):
+    cells = [Measurement(0.1 / 2**k, error=e, steps=n) for k, (e, n) in enumerate(zip(errors, steps, strict=True))]
+    assert gains_nothing(cells, 1e-13) is ends
 
 
 @pytest.mark.parametrize(("factor", "turned"), [(0.9, False), (1.3, False), (1.7, True), (5.0, True)])

@@ -22,6 +22,14 @@ _MAX_SLOPE_SPREAD: Final = 0.3
 _MIN_POINTS: Final = 3
 #: An error that is so many times as large has turned.
 _MIN_TURNED_ERROR_RATIO: Final = 1.5
+#: A sweep over the study's own grid ends after so many settings in a row that bring no smaller error.
+_MAX_SETTINGS_WITHOUT_GAIN: Final = 2
+#: A setting is finer if it takes at least so many times the steps: a decade of a tolerance is 1.33 at order 8.
+_MIN_STEPS_RATIO: Final = 1.2
+#: Larger errors may still fall again, as those of steps that are too large do.
+_MAX_CONVERGED_ERROR: Final = 1e-6
+#: Errors that differ by less than this part are one: that of an engine's own law, such as soft loops, at any step.
+_MAX_SETTLED_SPREAD: Final = 0.01
 
 
 @dataclass(frozen=True)
@@ -129,3 +137,19 @@ def _longest_steady(x: Array, y: Array) -> slice | None:
             if best is None or stop + 1 - start >= best.stop - best.start:
                 best = slice(start, stop + 1)
     return best
+
+
+def gains_nothing(cells: Sequence[Measurement], floor: float) -> bool:
+    """Return whether the last settings, coarse to fine, brought no smaller error: at the floor, or at rounding."""
+    # Steps that end on the saved times can be shorter than a coarse tolerance needs: of settings that hardly add a
+    # step, only the first shows whether finer ones help.
+    counted = [*cells[:1]]
+    for cell in cells[1:]:
+        if not cell.error > floor or cell.steps >= _MIN_STEPS_RATIO * counted[-1].steps:
+            counted.append(cell)
+    errors = [cell.error for cell in counted]
+    least = min(filter(math.isfinite, errors[:-_MAX_SETTINGS_WITHOUT_GAIN]), default=math.inf)
+    last = errors[-_MAX_SETTINGS_WITHOUT_GAIN - 1 :]
+    if least > _MAX_CONVERGED_ERROR:
+        return len(last) > _MAX_SETTINGS_WITHOUT_GAIN and max(last) - min(last) < _MAX_SETTLED_SPREAD * min(last)
+    return all(not e < max(0.5 * least, floor) or e <= floor for e in errors[-_MAX_SETTINGS_WITHOUT_GAIN:])

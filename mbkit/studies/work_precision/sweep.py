@@ -30,7 +30,7 @@ from mbkit.simulate import Trajectory
 from mbkit.studies.measurement import Measurement, Problem, Truth, farthest
 from mbkit.studies.results import Refusal
 from mbkit.studies.study_runs import OUT_OF_TIME, Deadline, TooLongError, quiet_simulate
-from mbkit.studies.work_precision.curve import Curve, observed_order
+from mbkit.studies.work_precision.curve import Curve, gains_nothing, observed_order
 from mbkit.studies.worker import run
 
 #: Errors are measured at the ends of this many equal parts of the horizon.
@@ -45,14 +45,6 @@ _EVALUATIONS_PER_PYTHON_CALL: Final = 8
 
 #: A run shorter than this is repeated within a round, s.
 _SHORT_RUN_SECONDS: Final = 2e-3
-#: A sweep over the study's own grid ends after so many settings in a row that bring no smaller error.
-_MAX_SETTINGS_WITHOUT_GAIN: Final = 2
-#: A setting is finer if it takes at least so many times the steps: a decade of a tolerance is 1.33 at order 8.
-_MIN_STEPS_RATIO: Final = 1.2
-#: Larger errors may still fall again, as those of steps that are too large do.
-_MAX_CONVERGED_ERROR: Final = 1e-6
-#: Errors that differ by less than this part are one: that of an engine's own law, such as soft loops, at any step.
-_MAX_SETTLED_SPREAD: Final = 0.01
 #: Parts of the time allowed until which compilation may begin, and until which every setting has run once.
 _COMPILING_PART: Final = 0.5
 _EXPLORING_PART: Final = 0.65
@@ -253,7 +245,7 @@ class CurveMeasurement:
             # Coarse tolerances that lead to the same steps are one point.
             if self.settings.required or before is None or not one.repeats(before):
                 self._runs.append(one)
-            if not self.settings.required and self._no_gain():
+            if not self.settings.required and gains_nothing([one.cell for one in self._runs], self.truth.floor):
                 self._left = []
 
     def _start(self, dyn: Dynamics, value: float) -> None:
@@ -283,23 +275,6 @@ class CurveMeasurement:
             return _Run(value, Measurement(value, "slow" if late else "refused", note=str(error)), first, preparation)
         first = time.perf_counter() - begun
         return _Run(value, self.problem.measured(value, self.truth, times, dyn, run), first, preparation)
-
-    def _no_gain(self) -> bool:
-        """Return whether the last settings brought no smaller error: at the reference's floor, or at rounding."""
-        floor = self.truth.floor
-        # Steps that end on the saved times can be shorter than a coarse tolerance needs: of settings that hardly
-        # add a step, only the first shows whether finer ones help.
-        first, *others = (one.cell for one in self._runs)
-        counted = [first]
-        for one in others:
-            if not one.error > floor or one.steps >= _MIN_STEPS_RATIO * counted[-1].steps:
-                counted.append(one)
-        errors = [one.error for one in counted]
-        least = min(filter(math.isfinite, errors[:-_MAX_SETTINGS_WITHOUT_GAIN]), default=math.inf)
-        last = errors[-_MAX_SETTINGS_WITHOUT_GAIN - 1 :]
-        if least > _MAX_CONVERGED_ERROR:
-            return len(last) > _MAX_SETTINGS_WITHOUT_GAIN and max(last) - min(last) < _MAX_SETTLED_SPREAD * min(last)
-        return all(not e < max(0.5 * least, floor) or e <= floor for e in errors[-_MAX_SETTINGS_WITHOUT_GAIN:])
 
     def give_up(self, reason: str) -> None:
         """End here; settings that the caller chose are reported with the reason why they were not run."""
