@@ -172,9 +172,17 @@ def test_every_check_has_a_test_of_its_limit():
 def test_density_from_foam_to_lead(found):
     volume = Link("a").truth[0] / 1500
     for rho, confidence in (
-        *((0.99 * checks.LEAD, ""), (1.01 * checks.LEAD, "look"), (2.9 * checks.LEAD, "look")),
-        *((3.1 * checks.LEAD, "likely"), (29 * checks.LEAD, "likely"), (31 * checks.LEAD, "sure")),
-        *((1.01 * checks.FOAM, ""), (0.99 * checks.FOAM, "look"), (checks.FOAM / 3.1, "likely")),
+        *((0.99 * checks.LEAD_DENSITY, ""), (1.01 * checks.LEAD_DENSITY, "look"), (2.9 * checks.LEAD_DENSITY, "look")),
+        *(
+            (3.1 * checks.LEAD_DENSITY, "likely"),
+            (29 * checks.LEAD_DENSITY, "likely"),
+            (31 * checks.LEAD_DENSITY, "sure"),
+        ),
+        *(
+            (1.01 * checks.FOAM_DENSITY, ""),
+            (0.99 * checks.FOAM_DENSITY, "look"),
+            (checks.FOAM_DENSITY / 3.1, "likely"),
+        ),
     ):
         rows = found(Link("a", density=rho))
         row = rows.get(("density", "a"))
@@ -187,7 +195,7 @@ def test_density_from_foam_to_lead(found):
 @pytest.mark.parametrize("share", [0.99, 1.01])
 def test_a_centre_of_mass_may_be_a_tenth_of_the_size_outside(found, share):
     a, size = Link("a"), float(np.linalg.norm(Link("a").size))
-    out = 0.05 + share * checks.OUTSIDE * size
+    out = 0.05 + share * checks.COM_OUTSIDE_RATIO * size
     row = found(replace(a, com=(out, 0, 0.2))).get(("centre of mass", "a"))
     assert (row is not None) == (share > 1)
     assert row is None or row.value == pytest.approx(out - 0.05, rel=1e-9)
@@ -204,12 +212,12 @@ def test_the_radius_of_gyration_is_within_the_shapes(found, share):
     a = Link("a")
     mass, own = a.truth
     corner = float(np.linalg.norm(a.size)) / 2
-    wide = mass * (share * checks.COARSE * corner) ** 2
+    wide = mass * (share * checks.LONGEST_GYRATION_RATIO * corner) ** 2
     assert (("radius of gyration", "a") in found(replace(a, inertia=wide * np.eye(3)))) == (share > 1)
-    compact = np.trace(own) / 3 / checks.COMPACT / share
+    compact = np.trace(own) / 3 / checks.SHORTEST_GYRATION_RATIO / share
     assert (("radius of gyration", "a") in found(replace(a, inertia=compact * np.eye(3)))) == (share > 1)
     # From the centre of mass at one end the other end is farther.
-    end = mass * (share * checks.COARSE * float(np.hypot(0.4, np.hypot(0.05, 0.03)))) ** 2
+    end = mass * (share * checks.LONGEST_GYRATION_RATIO * float(np.hypot(0.4, np.hypot(0.05, 0.03)))) ** 2
     assert (("radius of gyration", "a") in found(replace(a, com=(0, 0, 0.4), inertia=end * np.eye(3)))) == (share > 1)
     far = mass * (share * 0.4) ** 2 * np.eye(3)
     assert (("radius of gyration", "a") in found(replace(a, inertia=far, shapes=""))) == (share > 1)
@@ -231,13 +239,13 @@ def aspect(apart: float) -> float:
 
 @pytest.mark.parametrize("share", [0.98, 1.02])
 def test_axes_that_are_far_off_and_fit_when_turned(found, share):
-    a = Link("a", size=(0.1, 0.1, aspect(share * checks.UNLIKE)))
+    a = Link("a", size=(0.1, 0.1, aspect(share * checks.UNLIKE_DISTANCE)))
     assert (("axes", "a") in found(replace(a, inertia=a.truth[1][::-1, ::-1]))) == (share > 1)
     long = Link("a", size=(0.05, 0.05, 0.5))
     _, own = long.truth
     # The nearer it comes to a sphere's, the less it is that of the shapes in other axes.
     sphere = np.trace(own) / 3 * np.eye(3)
-    t = share * checks.ALIKE / float(np.linalg.norm(own - sphere) / np.trace(own))
+    t = share * checks.ALIKE_DISTANCE / float(np.linalg.norm(own - sphere) / np.trace(own))
     blurred = ((1 - t) * own + t * sphere)[::-1, ::-1]
     assert (("axes", "a") in found(replace(long, inertia=blurred))) == (share < 1)
 
@@ -245,7 +253,7 @@ def test_axes_that_are_far_off_and_fit_when_turned(found, share):
 @pytest.mark.parametrize("share", [0.98, 1.02])
 def test_axes_are_judged_where_the_mass_is_spread_as_the_shapes(found, share):
     a = Link("a", size=(0.1, 0.06, 0.6), xyz=(0, 0, 0.3))
-    off = share * checks.CENTRED * float(np.linalg.norm(a.size))
+    off = share * checks.CENTRED_RATIO * float(np.linalg.norm(a.size))
     rows = found(replace(a, inertia=a.truth[1][::-1, ::-1], com=(0, 0, 0.3 + off)))
     assert (("axes", "a") in rows) == (share < 1)
 
@@ -255,19 +263,19 @@ def test_an_inertia_about_the_origin_fits_only_there(found, share):
     long = Link("a", size=(0.05, 0.05, 0.4))
     mass, own = long.truth
     # A centre so far from the origin that the inertia about this is `SOLID` times that about the centre.
-    off = float(np.sqrt(share * (checks.SOLID - 1) * np.trace(own) / (2 * mass)))
+    off = float(np.sqrt(share * (checks.SOLID_INERTIA_RATIO - 1) * np.trace(own) / (2 * mass)))
     row = found(replace(long, xyz=(0, 0, off), inertia=own + mass * steiner((0, 0, off)))).get(
         ("inertia about origin", "a")
     )
     assert (row is not None) == (share > 1)
     assert row is None or row.confidence == "likely"
-    assert row is None or row.value == pytest.approx(1 + share * (checks.SOLID - 1), rel=1e-9)
+    assert row is None or row.value == pytest.approx(1 + share * (checks.SOLID_INERTIA_RATIO - 1), rel=1e-9)
     # A solid body that is also heavy elsewhere fits at neither point.
-    far = own + mass * steiner((0, 0, 0.2)) + share * checks.FITS * np.trace(own) / np.sqrt(3) * np.eye(3)
+    far = own + mass * steiner((0, 0, 0.2)) + share * checks.FITTING_DISTANCE * np.trace(own) / np.sqrt(3) * np.eye(3)
     assert (("inertia about origin", "a") in found(replace(long, inertia=far))) == (share < 1)
     # With a part s of the theorem's term the distances are as s to 1 - s.
     p = (0, 0, float(np.sqrt(1.2 * np.trace(own) / (np.sqrt(2) * mass))))
-    part = share * checks.BETTER / (1 + checks.BETTER)
+    part = share * checks.BETTER_DISTANCE_RATIO / (1 + checks.BETTER_DISTANCE_RATIO)
     row = found(replace(long, xyz=p, inertia=own + part * mass * steiner(p)))
     assert (("inertia about origin", "a") in row) == (share > 1)
 
@@ -275,7 +283,7 @@ def test_an_inertia_about_the_origin_fits_only_there(found, share):
 @pytest.mark.parametrize("share", [0.99, 1.01])
 def test_inertias_off_from_a_solid_body_share_one_finding(found, share):
     a, b = Link("a"), Link("b", "a")
-    for factor in (share * checks.SOLID, 1 / (share * checks.SOLID)):
+    for factor in (share * checks.SOLID_INERTIA_RATIO, 1 / (share * checks.SOLID_INERTIA_RATIO)):
         row = found(replace(a, inertia=factor * a.truth[1]), b).get(("solid body", "a"))
         assert (row is not None) == (share > 1)
         assert row is None or (row.confidence, row.others) == ("look", ())
@@ -288,7 +296,7 @@ def test_inertias_off_from_a_solid_body_share_one_finding(found, share):
 @pytest.mark.parametrize("share", [0.9, 1.1])
 def test_axes_of_unit_length(tmp_path, share):
     path = write(tmp_path, Link("a"), Link("b", "a", joint="fixed"))
-    length = 1 + share * checks.UNIT
+    length = 1 + share * checks.AXIS_LENGTH_ERROR
     path.write_text(path.read_text().replace('axis xyz="0 1 0"', f'axis xyz="0 {length!r} 0"'))
     rows = [row for row in mb.lint(path).rows if row.check == "unit axes"]
     assert [row.part for row in rows] == ["a_joint"] * (share > 1)
@@ -312,10 +320,10 @@ def leaning(product: float) -> Link:
 
 @pytest.mark.parametrize("share", [0.98, 1.02])
 def test_signs_of_products_that_matter(found, share):
-    a = leaning(share * checks.ALIKE / (2 * np.sqrt(2)))
+    a = leaning(share * checks.ALIKE_DISTANCE / (2 * np.sqrt(2)))
     assert (("sign of products", "a") in found(replace(a, inertia=flipped(a.truth[1])))) == (share > 1)
     # Products of s times the size: the distances are as 1 + s to 1 - s.
-    b, ratio = leaning(0.15), checks.BETTER * share
+    b, ratio = leaning(0.15), checks.BETTER_DISTANCE_RATIO * share
     s, own = (ratio - 1) / (ratio + 1), b.truth[1]
     smaller = np.diag(np.diag(own)) - s * (own - np.diag(np.diag(own)))
     assert (("sign of products", "a") in found(replace(b, inertia=smaller))) == (share > 1)
@@ -332,11 +340,11 @@ def test_copied_inertias_are_on_several_links_that_differ(found, share):
     a, b = Link("a"), Link("b", "a")
     own = a.truth[1]
     # All lengths by f: moments over mass by f².
-    f = float(np.sqrt(share * checks.OTHER_SHAPE))
+    f = float(np.sqrt(share * checks.OTHER_SHAPE_RATIO))
     same = {"mass": a.truth[0], "inertia": own}
     c = Link("c", "a", size=tuple(f * x for x in a.size), **same)
     assert (("copied inertia", "a") in found(a, b, c)) == (share > 1)
-    heavier = Link("c", "a", mass=a.truth[0] / (1 - share * checks.MIRRORED), inertia=own)
+    heavier = Link("c", "a", mass=a.truth[0] / (1 - share * checks.MIRRORED_ERROR), inertia=own)
     assert (("copied inertia", "a") in found(a, b, heavier)) == (share > 1)
     assert ("copied inertia", "a") not in found(a, replace(c, mass=2 * a.truth[0]))
 
@@ -352,11 +360,11 @@ def bare(names: str, **changes: Any) -> list[Link]:
 
 @pytest.mark.parametrize("share", [0.99, 1.01])
 def test_neighbours_without_shapes(found, share):
-    for mass in (share * checks.APART, 1 / (share * checks.APART)):
+    for mass in (share * checks.NEIGHBOUR_MASS_RATIO, 1 / (share * checks.NEIGHBOUR_MASS_RATIO)):
         rows = found(*bare("a b c d", c={"mass": mass, "inertia": mass * np.diag([0.011, 0.012, 0.013])}))
         assert (("neighbours", "c") in rows) == (share > 1)
         assert not {part for check, part in rows if check == "neighbours"} - {"c"}
-    rows = found(*bare("a b c d", c={"origin": (0, 0, share * checks.FAR * 0.4)}))
+    rows = found(*bare("a b c d", c={"origin": (0, 0, share * checks.NEIGHBOUR_DISTANCE_RATIO * 0.4)}))
     assert (("neighbours", "c_joint") in rows) == (share > 1)
     # A light link beside a heavy one is none that differs from its robot.
     assert not found(*bare("a b", b={"mass": 1e-2, "inertia": np.diag([1.1, 1.2, 1.3]) * 1e-4}))
@@ -385,7 +393,7 @@ def pairs(count: int, *wrong: tuple[str, np.ndarray]) -> list[Link]:
 
 @pytest.mark.parametrize("share", [0.98, 1.02])
 def test_links_that_mirror_but_for_one_number(found, share):
-    part = share * checks.MIRRORED
+    part = share * checks.MIRRORED_ERROR
     inertia, com = flipped(LEG), np.array([0.01, -0.02, 0.1])
     radius = np.sqrt(0.036)
     for wrong in (
@@ -431,9 +439,9 @@ def limited(**limit: float) -> Link:
 @pytest.mark.parametrize("share", [0.999, 1.001])
 def test_limits_beyond_two_turns_and_those_that_stand_for_none(found, share):
     key = "limits in degrees", "a_joint"
-    assert (key in found(limited(upper=share * checks.MOST_TURN))) == (share > 1)
-    assert (key in found(limited(upper=share * checks.NO_LIMIT))) == (share < 1)
-    message = found(limited(lower=-90, upper=90 + checks.WHOLE / share * 0.999))[key].message
+    assert (key in found(limited(upper=share * checks.MAX_TURN_RAD))) == (share > 1)
+    assert (key in found(limited(upper=share * checks.LEAST_MISSING_LIMIT))) == (share < 1)
+    message = found(limited(lower=-90, upper=90 + checks.WHOLE_DEGREE_ERROR / share * 0.999))[key].message
     assert ("whole numbers" in message) == (share > 1)
 
 
@@ -570,7 +578,7 @@ def call(*arguments: Any) -> Any:
 def test_the_command_ends_by_what_it_found(tmp_path):
     good = call(write(tmp_path, Link("a")))
     assert (good.exit_code, good.stdout.split(":")[0]) == (0, "✓ robot")
-    look = call(write(tmp_path, Link("a", density=1.5 * checks.LEAD)))
+    look = call(write(tmp_path, Link("a", density=1.5 * checks.LEAD_DENSITY)))
     assert look.exit_code == 0
     assert "look" in look.stdout
     impossible = Link("a", inertia=np.diag([1, 1, 3.0]))
@@ -585,7 +593,7 @@ def test_the_command_ends_by_what_it_found(tmp_path):
 
 
 def test_check_says_that_engines_judge_no_file(tmp_path):
-    path = write(tmp_path, Link("a", density=1e3 * checks.LEAD), Link("b", "a"))
+    path = write(tmp_path, Link("a", density=1e3 * checks.LEAD_DENSITY), Link("b", "a"))
     arguments = ["check", str(path), "--no-rollouts", "--samples", "2", "--json", "--out", str(tmp_path / "out")]
     result = CliRunner().invoke(cli, arguments)
     assert result.exit_code == 0, result.output
@@ -596,7 +604,9 @@ def test_check_says_that_engines_judge_no_file(tmp_path):
 
 
 def test_the_assert_names_the_number_and_can_ignore(tmp_path):
-    path = write(tmp_path, Link("a", density=1e3 * checks.LEAD), Link("b", "a", density=1.5 * checks.LEAD))
+    path = write(
+        tmp_path, Link("a", density=1e3 * checks.LEAD_DENSITY), Link("b", "a", density=1.5 * checks.LEAD_DENSITY)
+    )
     with pytest.raises(
         AssertionError, match=r"1 findings that are sure or likely\n  a: .* kg/m³ \(density, sure\); expected"
     ):

@@ -12,7 +12,7 @@ from mbkit.engines.remote import importer
 from mbkit.engines.remote.packages import PACKAGES, EngineVersion, Package, register_remote_engine
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.studies.importers.result import TERMS
-from mbkit.studies.importers.study import _SINGLE
+from mbkit.studies.importers.study import _SINGLE_TOLERANCE
 from tests.test_engine_versions import present
 from tests.test_parsers import LINK, MJCF, arm, causes, urdf, write
 
@@ -47,7 +47,7 @@ def test_newton_corrects_inertias_and_says_which(tmp_path: Path) -> None:
     assert newton.explanation.explained
     sound = mb.compare_parsers(write(tmp_path, arm()), ["newton"]).importers[0]
     assert sound.agrees
-    assert 0 < max(s.worst for s in sound.stages if s.name in ("M", "g", "nle")) < _SINGLE
+    assert 0 < max(s.worst for s in sound.stages if s.name in ("M", "g", "nle")) < _SINGLE_TOLERANCE
 
 
 def test_newton_reads_joints_of_one_body_at_one_place(tmp_path: Path) -> None:

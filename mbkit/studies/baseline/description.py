@@ -75,7 +75,7 @@ def _written(model: Model, parameters: Part) -> Description:
     named = {"T": s.T, "V": s.V, "dissipation": s.dissipation, "forces": list(s.forces)}
     named |= {f"constraint {k + 1}": x for k, x in enumerate(s.constraints)}
     if hasattr(s, "D"):
-        # Of a system in quasi-velocities: what makes them the coordinates' rates.
+        # The matrix that makes quasi-velocities the coordinates' rates.
         named["D"] = s.D.tolist()
     names = {"coordinates": ", ".join(model.coordinate_names), "velocities": ", ".join(model.velocity_names)}
     return {
@@ -140,19 +140,19 @@ def moving_mass(description: Mapping[str, Mapping[str, Part]]) -> tuple[float, A
     return mass, np.array(gravity, dtype=np.float64)
 
 
-# What two descriptions differ in, parameter by parameter, in words.
+# Differences of two descriptions, parameter by parameter, in words.
 
 _EPS: Final = float(np.finfo(float).eps)
-# Another release of a parser may add the same numbers in another order.
-_ROUNDINGS: Final = 64
+#: Roundings in a number: another release of a parser may add the same numbers in another order.
+_MAX_ROUNDINGS: Final = 64
 _XYZ: Final = ENTRIES[:3]
 _ENTRIES: Final = {
     **{name: _XYZ for name, rule in _RULES.items() if rule.shape == (3,)},
     "inertia": tuple(name for name, _ in SYMMETRIC),
     "axes": (*_XYZ, *(f"{x} of the second" for x in _XYZ)),
 }
-# A smaller turn is within the rounding of its sine.
-_TURNED: Final = 1e-7
+#: Least turn that is told, rad; a smaller one is within the rounding of its sine.
+_LEAST_TURN_RAD: Final = 1e-7
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ def _more(section: str, name: str, description: Description) -> str:
 
 def _fields(section: str, name: str, owner: str, before: Part, after: Part) -> Iterator[Change]:
     for field in dict.fromkeys([*before, *after]):
-        # What is left out of a flat section does not exist, rather than being zero.
+        # A number that a flat section leaves out does not exist, rather than being zero.
         absent = section in FLAT and section != "system"
         old = before.get(field, None if absent else default(field, after.get(field)))
         new = after.get(field, None if absent else default(field, before.get(field)))
@@ -260,7 +260,7 @@ def _turn(old: Array, new: Array) -> str:
     """Return by how much and about which of the old axes a frame has turned; empty for a turn within rounding."""
     turned = spatial.log_quaternion(spatial.quaternion_from_matrix(old.reshape(3, 3).T @ new.reshape(3, 3)))
     angle = float(np.linalg.norm(turned))
-    if angle < _TURNED:
+    if angle < _LEAST_TURN_RAD:
         return ""
     axis = ", ".join(f"{x:g}" for x in np.round(turned / angle, 4) + 0.0)
     return f"turned by {angle:.6g} rad about ({axis})"
@@ -270,10 +270,10 @@ def _only_rounding(field: str, old: Array, new: Array) -> bool:
     if not (np.isfinite(old).all() and np.isfinite(new).all()):
         return False
     rule = _RULES.get(field)
-    # Of places, directions and limits zero is no size: an origin moved by 1e-17 m has not moved.
+    # Zero is no size of a place, a direction or a limit: an origin moved by 1e-17 m has not moved.
     absolute = rule and (rule.direction or rule.place or rule.shape == OF_Q)
     size = max(float(np.linalg.norm(old)), 1.0 if absolute else 0.0)
-    return float(np.linalg.norm(new - old)) <= _ROUNDINGS * _EPS * size
+    return float(np.linalg.norm(new - old)) <= _MAX_ROUNDINGS * _EPS * size
 
 
 # A `Model` has one body for links that are fixed to each other. Their own numbers are recorded beside it, so that a

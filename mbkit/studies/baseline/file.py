@@ -33,10 +33,10 @@ ROLLOUT: Final = "rollout"
 FRAMES: Final = "frames"
 _OF_FRAME: Final = {"pose": slice(0, 12), "velocity": slice(12, 18)}
 VECTORS: Final = ("q", "v", "a", "tau")
-#: Of the file. Another number is another layout, which this one does not read.
+#: Number of the file's layout; another layout is not read.
 FORMAT: Final = 1
-#: Of a rollout that a file asks for; `record` writes far fewer.
-_MAX_STEPS: Final = 10_000
+#: Most steps of a rollout that a file may ask for; `record` writes far fewer.
+_MAX_ROLLOUT_STEPS: Final = 10_000
 _HEAD: Final = "# mbkit baseline: "
 _NOTE: Final = (
     f"{_HEAD}what engines said of one robot. Written by mbkit and guarded by the checksum in its last line:\n"
@@ -61,7 +61,7 @@ class Rollout:
 
 @dataclass(frozen=True, eq=False)
 class Baseline:
-    """What was recorded of one model, as `record` returns and `read` reads it.
+    """The record of one model, as `record` returns and `read` reads it.
 
     `digest` is the model's fingerprint, `Model.digest`. `target` and `options` are what `mbkit baseline check` loads,
     and how; empty for a model without a source. `versions` are those of what computes, by package. `description` has
@@ -257,8 +257,8 @@ def _check(b: Baseline) -> None:
     """Raise `ValueError` for texts and numbers that no recording holds."""
     texts = [b.model, b.digest, b.target, b.processor, *b.states.kinds, *b.versions, *b.versions.values(), *b.errors]
     _expect(all(isinstance(x, str) for x in texts), "a name, a target or a version is no text")
-    whole = type(b.seed) is int and type(b.rollout.steps) is int and 0 < b.rollout.steps <= _MAX_STEPS
-    _expect(whole, f"expected a whole number as seed, and 1 to {_MAX_STEPS} steps of the rollout")
+    whole = type(b.seed) is int and type(b.rollout.steps) is int and 0 < b.rollout.steps <= _MAX_ROLLOUT_STEPS
+    _expect(whole, f"expected a whole number as seed, and 1 to {_MAX_ROLLOUT_STEPS} steps of the rollout")
     _expect(bool(b.errors) and "M" in b.terms, "no terms, no mass matrix or no engines")
     for section, parts in b.description.items():
         for name, x in ((name, x) for part in parts.values() for name, x in part.items()):
@@ -436,7 +436,7 @@ def _value(x: Any) -> str:
     if isinstance(x, (list, tuple)):
         return f"[{', '.join(map(_value, x))}]"
     if isinstance(x, str):
-        # What JSON escapes, TOML reads alike, but for characters of two units, which TOML writes as one.
+        # TOML reads JSON's escapes, but writes characters of two units as one.
         return "".join(
             f"\\U{ord(c):08x}" if ord(c) > 0xFFFF and not c.isprintable() else json_text(c)
             for c in json.dumps(x, ensure_ascii=False)

@@ -14,8 +14,8 @@ from mbkit.studies.results import Refusal, ResultTable, columns_of, counted
 
 Status = Literal["same", "versions", "numbers", "description", "skipped"]
 # A person acts on the first few; the rest is in the data.
-_MOST: Final = 5
-_MOST_CHANGES: Final = 20
+_MAX_NUMBERS_SHOWN: Final = 5
+_MAX_CHANGES_SHOWN: Final = 20
 _MARKS: Final[dict[str, tuple[str, Style]]] = {
     "note": ("·", "muted"),
     "version": ("·", "muted"),
@@ -136,8 +136,8 @@ class BaselineResult(ResultTable):
 
         Unless `everything` is set, the first 20 parameters and of each engine the 5 numbers that are off most.
         """
-        most = len(self.moved) if everything else _MOST
-        shown = self.changes if everything else self.changes[:_MOST_CHANGES]
+        most = len(self.moved) if everything else _MAX_NUMBERS_SHOWN
+        shown = self.changes if everything else self.changes[:_MAX_CHANGES_SHOWN]
         for change in shown:
             yield "description", change.text
         if len(shown) < len(self.changes):

@@ -51,16 +51,16 @@ from mbkit.studies.study_runs import quiet_simulate, require_motion
 FINE: Final = 8.0 * float(np.finfo(float).eps)
 ROUNDING: Final = 1e-9
 OWN: Final = 1e-12
-_FACTOR: Final = 16.0
-#: Of the motion of a robot an excerpt, in which rounding does not grow.
+_ERROR_MARGIN: Final = 16.0
+#: An excerpt of a robot's motion, in which rounding does not grow.
 _ROLLOUT: Final = Rollout(dt=2e-3, steps=25)
-# States are written in a file for people: of these decimals every double is its own shortest text.
-_DECIMALS: Final = 6
+#: Decimals of a state in a file for people: every double of these is its own shortest text.
+_STATE_DECIMALS: Final = 6
 #: The description and the states come from these, whatever the engine.
 _SHARED: Final = ("mbkit", "pin", "numpy")
 _ABSENT: Final = "not installed"
-#: m and rad: what another parser's rounding moves a frame by.
-_FRAME_STAYS: Final = 1e-12
+#: Shift of a frame, m and rad, by another parser's rounding.
+_FRAME_ROUNDING: Final = 1e-12
 Versions = tuple[VersionChange, ...]
 _OTHER_COORDINATES: Final = "q and v have other joints or another order than recorded, so no number can be compared"
 
@@ -352,14 +352,14 @@ def _states(model: Model, samples: int, seed: int) -> States:
     # Limits act on no term, and at zero axes are aligned as they are near singular: a file is read by people.
     which = [*range(samples), *[k for k, kind in enumerate(drawn.kinds) if kind == "near singular"][:1]]
     q, v, a, tau = (x[which] for x in (drawn.q, drawn.v, drawn.a, drawn.tau))
-    a, tau = (np.round(x, _DECIMALS // 2) + 0.0 for x in (a, tau))
+    a, tau = (np.round(x, _STATE_DECIMALS // 2) + 0.0 for x in (a, tau))
     if not model.constrained:
         # Rounded, a state would be off the constraints, and a quaternion off its unit length.
         exact = np.zeros(model.nq, dtype=bool)
         for start, _ in model.quaternions:
             exact[start : start + 4] = True
-        q = np.where(exact, q, np.round(q, _DECIMALS)) + 0.0
-        v = np.round(v, _DECIMALS // 2) + 0.0
+        q = np.where(exact, q, np.round(q, _STATE_DECIMALS)) + 0.0
+        v = np.round(v, _STATE_DECIMALS // 2) + 0.0
     return States(q, v, a, tau, tuple(drawn.kinds[k] for k in which))
 
 
@@ -499,7 +499,7 @@ def _allowed(baseline: Baseline, engine: str, term: str) -> float:
     if term == ROLLOUT:
         # Rounding grows along a motion, by what only the motion tells: the worst of all engines.
         recorded = max(e[term] for e in baseline.errors.values() if e.get(term, np.inf) <= ROUNDING)
-    return _FACTOR * max(recorded, FINE)
+    return _ERROR_MARGIN * max(recorded, FINE)
 
 
 def differences(
@@ -591,7 +591,7 @@ def _moved_frames(recorded: Baseline, model: Model) -> str:
             far[name] = np.inf, np.inf
         turn = spatial.log_quaternion(spatial.quaternion_from_matrix(before[2].T @ after[2]))
         moved = float(np.linalg.norm(after[1] - before[1])), float(np.linalg.norm(turn))
-        if max(moved) > _FRAME_STAYS:
+        if max(moved) > _FRAME_ROUNDING:
             far.setdefault(name, moved)
     if not far:
         return ""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import chain, combinations, islice
+from itertools import chain, combinations
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -26,18 +26,16 @@ from mbkit.studies.explain import terms
 from mbkit.studies.explain.merged_model import MergedModel, merge, number_text
 from mbkit.studies.explain.mistakes import Mistake, body_mistakes, joint_mistakes
 from mbkit.studies.explain.result import Cause, Explanation
-from mbkit.studies.explain.terms import Gap, Gaps, States, Values, evaluated, gaps, larger, model_terms
+from mbkit.studies.explain.terms import TINY, Gap, Gaps, States, Values, evaluated, gaps, larger, model_terms
 
-#: What adds to T along a rate.
+#: The field that adds to T along a rate.
 _ROTOR: Final = JointCoupling.adding_to("T")[0]
-#: Pairs of joints tried in each other's place.
-_MAX_SWAPS: Final = 400
 #: Numbers of a joint that an engine may leave out, and what they are called.
-_LEFT_OUT: Final = {n: n for n in ("armature", "damping", "friction")} | {"stiffness": "spring"}
+_JOINT_NUMBERS: Final = {n: n for n in ("armature", "damping", "friction")} | {"stiffness": "spring"}
 #: Quantities beside the terms of every explanation, in which known defects show.
-_MORE_TERMS: Final = (("C v", "coriolis_force"), ("kinetic energy", "kinetic_energy"))
+_FURTHER_TERMS: Final = (("C v", "coriolis_force"), ("kinetic energy", "kinetic_energy"))
 #: Terms mixed up: kind, sentence, and each term's parts with their factors.
-_MIXES: Final[tuple[tuple[str, str, dict[str, dict[str, float]]], ...]] = (
+_MIXED_TERMS: Final[tuple[tuple[str, str, dict[str, dict[str, float]]], ...]] = (
     (
         "gravity",
         "has the gravity forces with the other sign",
@@ -48,11 +46,13 @@ _MIXES: Final[tuple[tuple[str, str, dict[str, dict[str, float]]], ...]] = (
     ("passive forces", "has passive forces with the other sign", {"passive": {"passive": -1.0}}),
 )
 #: Unit inertias xx, xy, xz, yy, yz, zz.
-_INERTIAS: Final = [np.maximum(x := np.outer(np.eye(3)[i], np.eye(3)[j]), x.T) for i in range(3) for j in range(i, 3)]
+_UNIT_INERTIAS: Final = [
+    np.maximum(x := np.outer(np.eye(3)[i], np.eye(3)[j]), x.T) for i in range(3) for j in range(i, 3)
+]
 #: Bodies whose terms span those of any matter: a mass at the origin and at a distance of one each way, and inertias.
-_PROBES: Final = (
+_PROBE_BODIES: Final = (
     *(MassProperties(1.0, x, np.zeros((3, 3))) for x in (np.zeros(3), *np.eye(3))),
-    *(MassProperties(0.0, np.zeros(3), I) for I in _INERTIAS),
+    *(MassProperties(0.0, np.zeros(3), I) for I in _UNIT_INERTIAS),
 )
 
 
@@ -64,12 +64,12 @@ def engine_causes(a: Model | Dynamics, b: Model | Dynamics, out: Explanation) ->
     before, after = study.before, study.after
     # A term that only some engines have differs for no other cause than a known defect.
     named = {term for c in defects for term in c.effects}
-    left = larger(after.terms, [g for g in study.more if g.term not in named])
+    left = larger(after.terms, [g for g in study.further_gaps if g.term not in named])
     explained = max((g.relative for g in left), default=np.inf) <= out.tolerance
     return replace(
         out,
-        agree=out.agree and max(before.worst, *(g.relative for g in study.more), 0.0) <= out.tolerance,
-        gaps=larger(out.gaps, (*before.terms, *study.more)),
+        agree=out.agree and max(before.worst, *(g.relative for g in study.further_gaps), 0.0) <= out.tolerance,
+        gaps=larger(out.gaps, (*before.terms, *study.further_gaps)),
         causes=(*out.causes, *defects, *causes),
         explained=out.explained and explained,
         left=larger(out.left, left),
@@ -99,7 +99,7 @@ class _Engines:
         self.a, self.b, self.tolerance, self.name = a, b, out.tolerance, out.b
         self.model = b.model
         self.at = terms.states_of(self.model, out.samples, out.seed)
-        self.owners = self.model.velocity_joints
+        self.joints = self.model.velocity_joints
         self.values = {dyn: evaluated(dyn, self.at) for dyn in (a, b)}
         for dyn, values in self.values.items():
             if "M" not in values:
@@ -107,33 +107,33 @@ class _Engines:
                     f"explain: {dyn.engine}: expected the mass matrix of {self.model.name}, by which differences are "
                     f"scaled, got only {', '.join(values) or 'no term'}; compare another engine"
                 )
-        self.wanted = self.values[b]
+        self.target = self.values[b]
         self.before = self.after = self._gaps(self.values[a])
-        self.more: list[Gap] = []
+        self.further_gaps: list[Gap] = []
         # Pinocchio is fast: it answers for the first engine where both say the same.
-        described = gaps(self.values[a], model_terms(self.model, self.at), self.at.v, self.owners)
-        self.fast = described.worst <= self.tolerance
+        described = gaps(self.values[a], model_terms(self.model, self.at), self.at.v, self.joints)
+        self.pinocchio_agrees = described.worst <= self.tolerance
 
     def _terms(self, model: Model, at: States | None = None) -> Values:
         """Return the first engine's terms of another description or at other states; none where it refuses."""
         at = self.at if at is None else at
         try:
-            return model_terms(model, at) if self.fast else evaluated(type(self.a)(model), at)
+            return model_terms(model, at) if self.pinocchio_agrees else evaluated(type(self.a)(model), at)
         except MbkitError:
             return {}
 
     def _gaps(self, values: Values) -> Gaps:
-        return gaps(values, self.wanted, self.at.v, self.owners)
+        return gaps(values, self.target, self.at.v, self.joints)
 
     def defects(self) -> list[Cause]:
         """Return the known defects that show: the engine's other computation of the value is right."""
         out = []
-        for term, quantity in _MORE_TERMS:
+        for term, quantity in _FURTHER_TERMS:
             sides = [(dyn, *self._asked(dyn, quantity)) for dyn in (self.a, self.b)]
             if any(values is None for _, values, _ in sides):
                 continue
             gap = self._gap(term, *(values for _, values, _ in sides))
-            self.more.append(gap)
+            self.further_gaps.append(gap)
             for (dyn, _, known), (_, other, _) in (sides, sides[::-1]) if gap.relative > self.tolerance else ():
                 own = self.values[dyn]
                 right: Any = 0.5 * np.einsum("ni,nij,nj->n", self.at.v, own["M"], self.at.v)
@@ -154,9 +154,9 @@ class _Engines:
         return values, [str(w.message) for w in caught if issubclass(w.category, KnownDefectWarning)]
 
     def _gap(self, term: str, a: Array, b: Array) -> Gap:
-        scale = max(float(np.abs(a).max()), float(np.abs(b).max()), 1e-300)
+        scale = max(float(np.abs(a).max()), float(np.abs(b).max()), TINY)
         off = np.abs(a - b)
-        joint = self.owners[int(np.argmax(off.max(axis=0)))] if off.ndim == 2 and off.any() else ""
+        joint = self.joints[int(np.argmax(off.max(axis=0)))] if off.ndim == 2 and off.any() else ""
         return Gap(term, float(off.max()) / scale, joint)
 
     def causes(self) -> list[Cause]:
@@ -183,7 +183,7 @@ class _Engines:
                 order[start : start + 4] = start + np.roll(np.arange(4), shift)
             says = f"reads quaternions w {one}, which are written w {other}"
             yield _Trial("quaternion order", "", says, self._answers(order))
-        for kind, says, mix in _MIXES:
+        for kind, says, mix in _MIXED_TERMS:
             known = {term: parts for term, parts in mix.items() if {term, *parts} <= own.keys()}
             mixed = {t: np.asarray(sum(x * own[name] for name, x in parts.items())) for t, parts in known.items()}
             yield _Trial(kind, "", says, own | mixed)
@@ -263,7 +263,7 @@ class _Engines:
             ("has the joints generation by generation", sorted(names, key=lambda name: len(model.chains[name]))),
             ("has the joints from last to first", names[::-1]),
         ]
-        for a, b in islice(combinations(names, 2), _MAX_SWAPS):
+        for a, b in combinations(names, 2):
             swapped = [{a: b, b: a}.get(name, name) for name in names]
             orders.append((f"has joints {a!r} and {b!r} in each other's place", swapped))
         for says, order in orders:
@@ -274,7 +274,7 @@ class _Engines:
 
     def _linear(self) -> Iterator[_Trial]:
         """Yield quantities left out of the whole robot, and fits of gravity, rotors and damping."""
-        own, wanted = self._terms(self.model), self.wanted
+        own, wanted = self._terms(self.model), self.target
         kinds = [
             k for name, k in PART_KINDS.items() if name in self.model.acts and k.does <= {"T", "V", "loss", "force"}
         ]
@@ -302,8 +302,8 @@ class _Engines:
         least = 1e-6 * max(1e-12, float(np.abs(amounts).max()))
         some = [k for k in range(self.model.nv) if abs(amounts[k]) > least]
         if some:
-            more = ", ".join(f"{number_text(float(amounts[k]))} more at {self.owners[k]!r}" for k in some)
-            subject = f"joint {self.owners[some[0]]!r}" if len(some) == 1 else "several joints"
+            more = ", ".join(f"{number_text(float(amounts[k]))} more at {self.joints[k]!r}" for k in some)
+            subject = f"joint {self.joints[some[0]]!r}" if len(some) == 1 else "several joints"
             yield _Trial(kind, subject, f"has {kind} {more}", values)
 
     def _couplings(self, own: Values) -> Iterator[_Trial]:
@@ -314,7 +314,7 @@ class _Engines:
             yield _Trial("joint coupling", f"coupling {c.name!r}", "lacks it", self._terms(left))
         turning = ", ".join(repr(c.name) for c in couplings if c.rotors)
         if turning and "M" in own:
-            chains = [self.model.chains[name] for name in self.owners]
+            chains = [self.model.chains[name] for name in self.joints]
             related = np.array([[a <= b or b <= a for a in chains] for b in chains])
             says = f"has no {_ROTOR} between branches"
             yield _Trial("joint coupling", f"coupling {turning}", says, own | {"M": own["M"] * related})
@@ -333,7 +333,7 @@ class _Engines:
                 says = f"has other matter in it: {number_text(more)} kg more than {mass}"
                 yield _Trial("inertia", subject, says, values)
         for joint in whole.model.joints:
-            none = [Mistake(kind, f"has no {kind}", {n: 0.0 * getattr(joint, n)}) for n, kind in _LEFT_OUT.items()]
+            none = [Mistake(kind, f"has no {kind}", {n: 0.0 * getattr(joint, n)}) for n, kind in _JOINT_NUMBERS.items()]
             for x in (*none, *joint_mistakes(joint)):
                 # A mimic joint that is free has other coordinates, and could not have been compared.
                 if x.fields.get("mimic", joint) is not None:
@@ -345,20 +345,20 @@ class _Engines:
         bodies = tuple(replace(b, **vars(NOTHING)) for b in whole.model.bodies)
         empty = replace(whole.model, bodies=bodies).without(*that_do("T"), "damping", "springs")
         alone = replace(whole, model=empty)
-        columns = [self._terms(alone.put(("bodies", name), vars(matter)).model) for matter in _PROBES]
+        columns = [self._terms(alone.put(("bodies", name), vars(matter)).model) for matter in _PROBE_BODIES]
         common = set(own).intersection(*columns)
         if "M" not in common:
             # The engine refuses bodies without matter.
             return None
-        off = (self.wanted["M"] - own["M"]).ravel()
+        off = (self.target["M"] - own["M"]).ravel()
         A = np.array([c["M"].ravel() for c in columns]).T
         root = np.sqrt(np.einsum("nii->ni", own["M"]))
-        weight = 1 / np.maximum(root[:, :, None] * root[:, None, :], 1e-300).ravel()
+        weight = 1 / np.maximum(root[:, :, None] * root[:, None, :], TINY).ravel()
         x = np.linalg.lstsq(A * weight[:, None], off * weight, rcond=1e-10)[0]
         if np.abs((A @ x - off) * weight).max() > self.tolerance:
             return None
         moved = {t: own[t] + sum(w * c[t] for w, c in zip(x, columns, strict=True)) for t in common - {"passive"}}
-        return float(x @ [mass_properties.mass for mass_properties in _PROBES]), own | moved
+        return float(x @ [mass_properties.mass for mass_properties in _PROBE_BODIES]), own | moved
 
     def subtree(self) -> tuple[str, ...]:
         """Return the smallest part on which the two engines still differ."""

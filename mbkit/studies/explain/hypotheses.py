@@ -43,9 +43,9 @@ _WORDS: Final = {
     "no_slip": ("contact without slip", "no slip"),
 }
 #: Relative difference of numbers written with five digits.
-_ROUNDED: Final = 2e-5
-#: More differences than this may be summarized as rounding.
-_MAX_LISTED: Final = 4
+_ROUNDED_DIFFERENCE: Final = 2e-5
+#: Most differences that are never summarized as rounding.
+_MAX_LISTED_ALONE: Final = 4
 
 
 class Change(NamedTuple):
@@ -92,9 +92,9 @@ CONSTRAINTS: Final = frozenset(words(section)[0] for section in CONSTRAINT_FEATU
 def summarized_differences(one: MergedModel, other: MergedModel, near: Tolerances) -> list[Hypothesis]:
     """Return the differences between two descriptions; many small ones are one, called rounding."""
     fine = differences(one, other, near)
-    if len(fine) <= _MAX_LISTED:
+    if len(fine) <= _MAX_LISTED_ALONE:
         return fine
-    coarse = differences(one, other, replace(near, relative=max(_ROUNDED, near.relative)))
+    coarse = differences(one, other, replace(near, relative=max(_ROUNDED_DIFFERENCE, near.relative)))
     if len(coarse) > len(fine) // 2:
         return fine
     large = {(change.where, name) for h in coarse for change in h.changes for name in change.ours}
@@ -102,7 +102,7 @@ def summarized_differences(one: MergedModel, other: MergedModel, near: Tolerance
     for where, *sides in (change for h in fine for change in h.changes):
         ours, theirs = ({n: x for n, x in side.items() if (where, n) not in large} for side in sides)
         small += [Change(where, ours, theirs)] if ours else []
-    says = f"has rounded numbers: {len(small)} of them differ, by less than {_ROUNDED:.0e} of their size"
+    says = f"has rounded numbers: {len(small)} of them differ, by less than {_ROUNDED_DIFFERENCE:.0e} of their size"
     return [*coarse, Hypothesis("rounding", "", says, tuple(small))]
 
 

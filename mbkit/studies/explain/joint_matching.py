@@ -21,10 +21,9 @@ from mbkit.studies.explain.hypotheses import Hypothesis, differences, links_in_c
 from mbkit.studies.explain.merged_model import OTHERS, MergedModel, Tolerances, at_itself, merge, reattached
 from mbkit.studies.explain.terms import fitting, restricted
 
-_NAME, _FRAME, _NUMBER, _KIND, _ALONE = 0.1, 0.25, 1.0, 3.0, 2.0
+#: Costs of another name, a frame or number that differs, another kind, and a joint that stays alone.
+_NAME_COST, _FRAME_COST, _NUMBER_COST, _KIND_COST, _ALONE_COST = 0.1, 0.25, 1.0, 3.0, 2.0
 _FRAMES: Final = ("rotation", "translation")
-#: Cost of an assignment that is not possible.
-_NEVER: Final = 1e12
 
 
 @dataclass(frozen=True)
@@ -115,12 +114,12 @@ class _Assignment:
         n, k = len(ours), len(theirs)
         alone = [self.a.sizes[j.child] for j in ours], [self.b.sizes[j.child] for j in theirs]
         if not n or not k:
-            return _ALONE * (sum(alone[0]) + sum(alone[1])), []
+            return _ALONE_COST * (sum(alone[0]) + sum(alone[1])), []
         # Beside the pairs, each joint may stay alone.
-        cost = np.full((n + k, n + k), _NEVER)
+        cost = np.full((n + k, n + k), np.inf)
         cost[n:, k:] = 0.0
-        cost[range(n), range(k, n + k)] = _ALONE * np.array(alone[0])
-        cost[range(n, n + k), range(k)] = _ALONE * np.array(alone[1])
+        cost[range(n), range(k, n + k)] = _ALONE_COST * np.array(alone[0])
+        cost[range(n, n + k), range(k)] = _ALONE_COST * np.array(alone[1])
         cost[:n, :k] = [[self._own(x, y) + below[x.child, y.child][0] for y in theirs] for x in ours]
         rows, columns = linear_sum_assignment(cost)
         pairs = [(ours[i], theirs[j]) for i, j in zip(rows, columns, strict=True) if i < n and j < k]
@@ -128,21 +127,26 @@ class _Assignment:
 
     def cost(self, to_b: Mapping[str, str]) -> float:
         """Return the cost of any assignment."""
-        total = _ALONE * (len(self.a.joints) + len(self.b.joints) - 2 * len(to_b))
+        total = _ALONE_COST * (len(self.a.joints) + len(self.b.joints) - 2 * len(to_b))
         for name, other in to_b.items():
             a, b = self.a.joints[name], self.b.joints[other]
             above, below = self.a.carrier.get(a.parent, ""), self.b.carrier.get(b.parent)
-            total += self._own(a, b) + (0.0 if to_b.get(above) == below else _NUMBER)
+            total += self._own(a, b) + (0.0 if to_b.get(above) == below else _NUMBER_COST)
         return total
 
     def _own(self, a: Joint, b: Joint) -> float:
         x, y, near = self.a.bodies[a.child], self.b.bodies[b.child], self.near
         far = np.array([[np.linalg.norm(a.translation)], [np.linalg.norm(b.translation)]])
-        other_kind = _FRAME if a.type.motion == b.type.motion else _KIND
+        other_kind = _FRAME_COST if a.type.motion == b.type.motion else _KIND_COST
         frames = len(near.differing(a, b, "axes", "rotation", "translation")) + (not near.point(x.com, y.com))
         numbers = (not near.point(*far)) + (not near.number(x.mass, y.mass))
         numbers += not near.inertia(self.a.moments[x.name], self.b.moments[y.name], x.mass)
-        return _NAME * (a.name != b.name) + other_kind * (a.kind != b.kind) + _FRAME * frames + _NUMBER * numbers
+        return (
+            _NAME_COST * (a.name != b.name)
+            + other_kind * (a.kind != b.kind)
+            + _FRAME_COST * frames
+            + _NUMBER_COST * numbers
+        )
 
 
 # The second description with names, order and frames of the first.

@@ -21,14 +21,15 @@ from mbkit.model.elements.formula import Formula
 from mbkit.model.parts import NumberRule, acting, rules_of
 from mbkit.studies.explain.merged_model import LinkInBody, Tolerances, composite, number_text, rules_for
 
-_WATER: Final = 1000.0  # kg/m³
+#: kg/m³.
+_WATER_DENSITY: Final = 1000.0
 _DEGREE: Final = np.pi / 180
 #: URDF's order of an inertia's six numbers, and MuJoCo's.
 _URDF: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _MJCF: Final = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 #: Numbers of a joint that are data.
 _BOUNDS: Final = tuple(name for name, rule in rules_of(Joint).items() if not rule.acts)
-#: What a field is called, where that is not its name.
+#: Words for a field, where they are not its name.
 _WORDS: Final = {
     "com": "centre of mass",
     "lower": "lower limit",
@@ -48,8 +49,8 @@ _KINDS: Final = {
 _PLACE: Final = ("rotation", "translation")
 _SPRING: Final = ("stiffness", "rest")
 MATTER: Final = ("mass", "com", "inertia")
-#: Numbers that a sentence says all of.
-_FEW: Final = 9
+#: Most numbers of a field that a sentence says.
+_MAX_NUMBERS_SHOWN: Final = 9
 
 
 class Mistake(NamedTuple):
@@ -99,7 +100,7 @@ def _changed(name: str, a: Any, b: Any, rule: NumberRule | None) -> str:
     what = _WORDS.get(name, name.replace("_", " "))
     if isinstance(b, np.ndarray) and b.size and np.isinf(b).all():
         return f"no {what} ({number_text(a)})"
-    if any((isinstance(x, np.ndarray) and x.size > _FEW) or isinstance(x, Formula) for x in (a, b)):
+    if any((isinstance(x, np.ndarray) and x.size > _MAX_NUMBERS_SHOWN) or isinstance(x, Formula) for x in (a, b)):
         return f"another {what}"
     unit = rule.unit if rule and rule.unit and "," not in rule.unit else ""
     return f"{what} {_text(b)} for {_text(a)} {unit}".rstrip()
@@ -158,7 +159,7 @@ def body_mistakes(links: Sequence[LinkInBody], R_PJ: Array, *, base: bool = Fals
     ):
         # Drake's substitute for inconsistent matter.
         if mass > 0:
-            radius = (mass / (4 / 3 * np.pi * _WATER)) ** (1 / 3)
+            radius = (mass / (4 / 3 * np.pi * _WATER_DENSITY)) ** (1 / 3)
             rows.append(("replaced inertia", says, {"mass": mass, "inertia": 0.4 * mass * radius**2 * np.eye(3)}))
     rows += [
         x for unit, name in (("mass", "mass"), ("inertia", "inertia")) for x in _units(unit, name, getattr(at, name))

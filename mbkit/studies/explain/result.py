@@ -204,7 +204,7 @@ def cause_blocks(causes: Iterable[Cause], apart: tuple[str, ...] = ()) -> list[B
     known = list(causes)
     for acts in (True, False):
         for kind, says, what in grouped(c for c in known if c.acts == acts):
-            # What a kind means is said once.
+            # The meaning of a kind is said once.
             again = any(b.head == kind for b in bullets)
             decides = acts and kind not in apart
             look: tuple[str, Style] = ("✗", "bad") if decides else ("!", "allowed")

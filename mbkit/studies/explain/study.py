@@ -32,8 +32,8 @@ from mbkit.studies.results import to_plain
 
 #: Parts of any kind are compared by their fields.
 EXPLAIN: Final = Path("explain", "explain compares bodies and joints of", frozenset(EFFECTS))
-#: At which forces of the time are compared, s.
-_TIME: Final = 0.37
+#: Time at which forces of the time are compared, s.
+_MOMENT_S: Final = 0.37
 
 
 def explain(
@@ -88,7 +88,7 @@ def explain(
     with unchecked():
         one, other = (replace(x, time=_moment(model_a, model_b)) for x in (model_a, model_b))
         sides = _Descriptions(one, other, names or _names(a, b), samples, seed, tolerance)
-        out = sides.with_held(sides.explain(), model_a, model_b)
+        out = sides.with_weights_held(sides.explain(), model_a, model_b)
         if not isinstance(a, Dynamics) and not isinstance(b, Dynamics):
             return out
         return engine_causes(a, b, out)
@@ -108,7 +108,7 @@ def _model(x: Model | Dynamics, which: str) -> Model:
 
 def _moment(*models: Model) -> float:
     """Return a time at which nothing begins, and which the tables of motions have."""
-    intervals = [(_TIME, _TIME), *(x.interval for x in models)]
+    intervals = [(_MOMENT_S, _MOMENT_S), *(x.interval for x in models)]
     return min(max(first for first, _ in intervals), *(last for _, last in intervals))
 
 
@@ -137,7 +137,7 @@ class _Descriptions:
         if moved_frames and self._gaps(theirs.model, target.model).worst > self.tolerance:
             target, moved_frames = theirs, ()
         before = by_name or self._gaps(one.model, theirs.model)
-        whole = self._whole(one.model, theirs.model) if before.worst <= self.tolerance else 0.0
+        whole = self._acceleration_gap(one.model, theirs.model) if before.worst <= self.tolerance else 0.0
         one, target = with_common_frames(*links_in_common_axes(one, target, near))
         changed, hypotheses = one, summarized_differences(one, target, near) if one.model.nv else []
         for h in hypotheses:
@@ -155,7 +155,7 @@ class _Descriptions:
         agree = alike and not (structural or massless or CONSTRAINTS.intersection(acting))
         explained = after.worst <= self.tolerance and (agree or massless or bool(acting))
         if explained and not agree and not massless:
-            left = self._whole(changed.model, target.model)
+            left = self._acceleration_gap(changed.model, target.model)
             explained, after = not left > self.tolerance, after.with_whole(left)
         found = before.with_whole(whole if whole > self.tolerance else np.nan)
 
@@ -183,7 +183,7 @@ class _Descriptions:
             compared=massless or not np.isnan(whole),
         )
 
-    def with_held(self, out: Explanation, a: Model, b: Model) -> Explanation:
+    def with_weights_held(self, out: Explanation, a: Model, b: Model) -> Explanation:
         """Return the explanation with what differs in the weights that the two whole descriptions hold, body by body.
 
         `explain` merges bodies, and such a force acts on each of them.
@@ -225,7 +225,7 @@ class _Descriptions:
         pairs = tuple(Match(n, n, "name") for n in ours)
         return self._gaps(one.model, rename_joints(other, one.model, Matching(pairs, (), ())).model)
 
-    def _whole(self, a: Model, b: Model) -> float:
+    def _acceleration_gap(self, a: Model, b: Model) -> float:
         """Return the difference between the accelerations of two whole systems; NaN where nothing can be compared."""
         same = a.velocity_names == b.velocity_names and a.nv
         return terms.whole_gap(a, b, self.samples, self.seed) if same else np.nan
@@ -240,7 +240,7 @@ class _Descriptions:
         effects: dict[str, float] = {}
         for model, changed in ((one, h.apply(one)), (target, h.revert(target))) if h.changes else ():
             if h.kind in CONSTRAINTS:
-                found = {WHOLE: float(np.nan_to_num(self._whole(model.model, changed.model), nan=np.inf))}
+                found = {WHOLE: float(np.nan_to_num(self._acceleration_gap(model.model, changed.model), nan=np.inf))}
             else:
                 found = self._gaps(model.model, changed.model).effects
             effects |= {term: max(x, effects.get(term, 0.0)) for term, x in found.items()}

@@ -33,7 +33,7 @@ from mbkit.studies.explain.merged_model import OTHERS
 #: Compared terms: name in tables, quantity, arguments.
 TERMS: Final = (("M", "mass_matrix", "q"), ("g", "gravity", "q"), ("nle", "nle", "qv"), ("passive", "passive", "qv"))
 #: Least size by which a force is divided.
-_TINY: Final = 1e-300
+TINY: Final = 1e-300
 #: Largest residual of a consistent state, relative to each row: rounded digits of a description leave as much.
 _CONSISTENT: Final = 1e-6
 #: The term of two whole systems, with their constraints and all forces.
@@ -188,7 +188,7 @@ def whole_gap(a: Model, b: Model, samples: int, seed: int) -> float:
                     return np.inf
                 apart = M @ (other.forward_dynamics(q[k], v[k], tau) - first)
                 size = np.abs(M) @ np.abs(first) + np.abs(own.nle(q[k], v[k])) + np.abs(tau)
-                gap = float(np.abs(apart).max() / max(float(size.max()), _TINY))
+                gap = float(np.abs(apart).max() / max(float(size.max()), TINY))
                 worst = np.inf if np.isnan(gap) else float(np.fmax(worst, gap))
         except NumericalError:
             # A mass that moves nothing: the terms tell.

@@ -18,7 +18,7 @@ from mbkit.model.elements.references import hung_on
 from mbkit.studies.explain.loops import exchanged, follows, moved, paired
 from mbkit.studies.explain.merged_model import Tolerances
 
-#: What switches equalities off, by element.
+#: Attributes that switch equalities off, by element.
 _SWITCHES: Final = {**dict.fromkeys(("equality", "connect", "weld"), ("active",)), "flag": ("equality", "constraint")}
 #: By how much a part differs, its name, and what differs in words.
 Difference = tuple[float, str, str]

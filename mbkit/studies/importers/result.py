@@ -1,4 +1,4 @@
-"""What a comparison of importers is: frozen data, and ways to read it."""
+"""A comparison of importers: frozen data, and ways to read it."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ from mbkit.studies.worker import Worker, describe
 
 #: The least tolerance of an importer that holds single precision. Of robots that Newton reads rightly, M of tiago_pro
 #: is off by most: 9e-6, 150 times its unit roundoff.
-_SINGLE: Final = 2.0**-16
+_SINGLE_TOLERANCE: Final = 2.0**-16
 _OWN_TERMS: Final = "own terms"
 
 # Importers run in worker processes, so that none of them can end, hang or fill the user's process. The processes are
@@ -321,7 +321,7 @@ def compare_parsers(
                 parsed[engine] = Parsed(engine, _version(engine), notes=notes)
                 continue
             single = engine in elsewhere and elsewhere[engine].package.bits < DOUBLE_BITS
-            near = {"tolerance": max(asked["tolerance"], _SINGLE)} if single else {}
+            near = {"tolerance": max(asked["tolerance"], _SINGLE_TOLERANCE)} if single else {}
             try:
                 parsed[engine] = compared(engine, imported, file, loops, asked | near)
             except ImporterError as error:

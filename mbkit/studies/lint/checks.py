@@ -26,46 +26,46 @@ from mbkit.studies.compare.rows import Finding
 from mbkit.studies.lint.geometry import Geometry
 from mbkit.studies.lint.result import LIKELY, LOOK, SURE, LintFinding
 
-#: From so many times beyond a limit on a finding is likely, and sure.
+#: Times beyond a limit from which a finding is likely, and sure.
 LIKELY_FROM: Final = 3.0
 SURE_FROM: Final = 30.0
-#: kg/m³: a light foam, and lead.
-FOAM: Final = 10.0
-LEAD: Final = 11_340.0
+#: Least and greatest density, kg/m³: a light foam, and lead.
+FOAM_DENSITY: Final = 10.0
+LEAD_DENSITY: Final = 11_340.0
 #: A centre of mass may be outside of the shapes by this part of their size: motors are drawn with the next link.
-OUTSIDE: Final = 0.1
+COM_OUTSIDE_RATIO: Final = 0.1
 #: A radius of gyration may be longer than the farthest corner by this factor: shapes are drawn coarsely.
-COARSE: Final = 1.2
+LONGEST_GYRATION_RATIO: Final = 1.2
 #: Its square may be less than that of the hull by this factor.
-COMPACT: Final = 30.0
+SHORTEST_GYRATION_RATIO: Final = 30.0
 #: Inertias are compared with that of the hull where the centres of mass are nearer than this part of its size.
-CENTRED: Final = 0.15
+CENTRED_RATIO: Final = 0.15
 #: Inertias over their traces differ by less where they are alike, and by more where they are not.
-ALIKE: Final = 0.1
-UNLIKE: Final = 0.25
+ALIKE_DISTANCE: Final = 0.1
+UNLIKE_DISTANCE: Final = 0.25
 #: A shell has up to about twice the inertia of a solid body; and this part of its trace is near.
-SOLID: Final = 2.0
-FITS: Final = 0.5
+SOLID_INERTIA_RATIO: Final = 2.0
+FITTING_DISTANCE: Final = 0.5
 #: Lengths of axes that were typed with two digits are off by less.
-UNIT: Final = 0.01
+AXIS_LENGTH_ERROR: Final = 0.01
 #: The products' other sign brings an inertia nearer by more than this.
-BETTER: Final = 2.5
+BETTER_DISTANCE_RATIO: Final = 2.5
 #: Masses, and distances between joints, of neighbours: a wrong unit makes 1e3 of a ratio that may be a third.
-APART: Final = 300.0
-FAR: Final = 100.0
+NEIGHBOUR_MASS_RATIO: Final = 300.0
+NEIGHBOUR_DISTANCE_RATIO: Final = 100.0
 #: Links with one inertia, and the ratio of moments from which their shapes differ.
-COPIES: Final = 3
-OTHER_SHAPE: Final = 1.5
-#: Of mirrored links: masses and inertias by themselves, and centres of mass by the radius of gyration.
-MIRRORED: Final = 0.1
+MIN_COPIES: Final = 3
+OTHER_SHAPE_RATIO: Final = 1.5
+#: Relative difference of masses and inertias of mirrored links, and of centres of mass by the radius of gyration.
+MIRRORED_ERROR: Final = 0.1
 #: Coordinates beyond this say that there is no limit.
-NO_LIMIT: Final = 1e3
-#: rad: two turns; joints beyond one are built.
-MOST_TURN: Final = 4 * np.pi
+LEAST_MISSING_LIMIT: Final = 1e3
+#: Longest way of a hinge: two turns; joints beyond one are built.
+MAX_TURN_RAD: Final = 4 * np.pi
 #: Degrees that were computed from radians are whole numbers to this.
-WHOLE: Final = 1e-3
-#: Random poses.
-POSES: Final = 256
+WHOLE_DEGREE_ERROR: Final = 1e-3
+#: Number of random poses.
+N_POSES: Final = 256
 
 _REFLECTIONS: Final = [np.array(signs) for signs in product((1.0, -1.0), repeat=3)]
 _UPPER: Final = np.triu_indices(3)
@@ -100,7 +100,7 @@ class Judged:
     @cached_property
     def poses(self) -> Array:
         """Random configurations, the same for the same model."""
-        return self.model.random_state(0, POSES)[0]
+        return self.model.random_state(0, N_POSES)[0]
 
 
 Check = Callable[[Judged], Iterator[LintFinding]]
@@ -125,12 +125,12 @@ def _confidence(times: float) -> str:
 @check
 def density(at: Judged) -> Iterator[LintFinding]:
     """Judge the mass over the volume of the link's shapes."""
-    expected = f"{FOAM:g} to {LEAD:g} kg/m³, from foam to lead"
+    expected = f"{FOAM_DENSITY:g} to {LEAD_DENSITY:g} kg/m³, from foam to lead"
     for body, shape in at.shaped():
         # The hull is the most that shapes can hold.
         heavy, light = body.mass / shape.hull.mass, body.mass / shape.least
-        if (times := max(heavy / LEAD, FOAM / light)) > 1:
-            rho, volume = (heavy, shape.hull.mass) if heavy > LEAD else (light, shape.least)
+        if (times := max(heavy / LEAD_DENSITY, FOAM_DENSITY / light)) > 1:
+            rho, volume = (heavy, shape.hull.mass) if heavy > LEAD_DENSITY else (light, shape.least)
             says = f"{body.mass:.3g} kg in the {1e3 * volume:.3g} l of its shapes are {rho:.3g} kg/m³"
             yield LintFinding(body.name, "density", rho, expected, _confidence(times), says)
 
@@ -141,7 +141,7 @@ def centre_of_mass(at: Judged) -> Iterator[LintFinding]:
     for body in at.bodies:
         shape = at.shapes.get(body.name)
         off = float(np.linalg.norm(body.com)) if shape is None else shape.outside(body.com)
-        allowed = at.reach if shape is None else OUTSIDE * shape.size
+        allowed = at.reach if shape is None else COM_OUTSIDE_RATIO * shape.size
         if allowed and off > allowed:
             what = "its joint; all joints together reach" if shape is None else "the hull of its shapes, which measures"
             says = f"centre of mass {off:.3g} m from {what} {at.reach if shape is None else shape.size:.3g} m"
@@ -166,8 +166,8 @@ def radius_of_gyration(at: Judged) -> Iterator[LintFinding]:
 
 def _radii(body: Body, shape: Geometry) -> tuple[float, float]:
     """Return the least and the greatest radius of gyration of a link, m; no point is beyond the farthest corner."""
-    mean = np.sqrt(np.trace(shape.hull.inertia) / shape.hull.mass / 2 / COMPACT)
-    return float(mean), COARSE * shape.farthest(body.com)
+    mean = np.sqrt(np.trace(shape.hull.inertia) / shape.hull.mass / 2 / SHORTEST_GYRATION_RATIO)
+    return float(mean), LONGEST_GYRATION_RATIO * shape.farthest(body.com)
 
 
 def _radius(body: Body, least: float, most: float) -> tuple[float, float]:
@@ -184,7 +184,7 @@ def _comparable(at: Judged) -> Iterator[tuple[Body, Array, Array]]:
     """Yield links with their inertia and that of their hull, each over its trace, where mass is spread as the hull."""
     for body, shape in at.shaped():
         fits = _radius(body, *_radii(body, shape))[1] <= 1 and not _placeholder(body)
-        if fits and np.linalg.norm(body.com - shape.hull.com) < CENTRED * shape.size:
+        if fits and np.linalg.norm(body.com - shape.hull.com) < CENTRED_RATIO * shape.size:
             yield body, body.inertia / np.trace(body.inertia), shape.hull.inertia / np.trace(shape.hull.inertia)
 
 
@@ -197,7 +197,7 @@ def sign_of_products(at: Judged) -> Iterator[LintFinding]:
             says = (
                 f"its inertia is off that of its shapes by {apart:.2g} of its trace, with products negated {other:.2g}"
             )
-            yield LintFinding(body.name, "sign of products", apart, f"below {ALIKE:g}", LIKELY, says)
+            yield LintFinding(body.name, "sign of products", apart, f"below {ALIKE_DISTANCE:g}", LIKELY, says)
 
 
 def _distances(own: Array, hull: Array) -> tuple[float, float]:
@@ -207,7 +207,7 @@ def _distances(own: Array, hull: Array) -> tuple[float, float]:
 
 
 def _sign_is_wrong(apart: float, other: float) -> bool:
-    return apart > ALIKE and other * BETTER < apart
+    return apart > ALIKE_DISTANCE and other * BETTER_DISTANCE_RATIO < apart
 
 
 @check
@@ -217,9 +217,9 @@ def axes(at: Judged) -> Iterator[LintFinding]:
         apart, other = _distances(own, hull)
         # The distance in the best axes is that of the principal moments (Hoffman and Wielandt 1953).
         best = float(np.linalg.norm(np.linalg.eigvalsh(own) - np.linalg.eigvalsh(hull)))
-        if apart > UNLIKE and best < ALIKE and not _sign_is_wrong(apart, other):
+        if apart > UNLIKE_DISTANCE and best < ALIKE_DISTANCE and not _sign_is_wrong(apart, other):
             says = f"its inertia is off that of its shapes by {apart:.2g} of its trace, in other axes {best:.2g}"
-            yield LintFinding(body.name, "axes", apart, f"below {UNLIKE:g}", LIKELY, says)
+            yield LintFinding(body.name, "axes", apart, f"below {UNLIKE_DISTANCE:g}", LIKELY, says)
 
 
 def _solids(at: Judged) -> Iterator[tuple[Body, Array, Array, Array]]:
@@ -239,7 +239,7 @@ def inertia_about_origin(at: Judged) -> Iterator[LintFinding]:
     """Find inertias that fit a solid body only if they are about the link's origin, and not about its centre."""
     for body, own, moved, solid in _solids(at):
         ratio, apart, other = np.trace(own), np.linalg.norm(own - solid), np.linalg.norm(moved - solid)
-        if ratio > SOLID and other < FITS and other * BETTER < apart:
+        if ratio > SOLID_INERTIA_RATIO and other < FITTING_DISTANCE and other * BETTER_DISTANCE_RATIO < apart:
             says = f"its inertia is {ratio:.2g} times that of its shapes, and {np.trace(moved):.2g} if about its origin"
             expected = "about the centre of mass"
             yield LintFinding(body.name, "inertia about origin", float(ratio), expected, LIKELY, says)
@@ -249,10 +249,13 @@ def inertia_about_origin(at: Judged) -> Iterator[LintFinding]:
 def solid_body(at: Judged) -> Iterator[LintFinding]:
     """Judge inertias against those of solid bodies of the same shapes and mass."""
     ratios = {body.name: float(np.trace(own)) for body, own, _, _ in _solids(at)}
-    if off := {k: x for k, x in ratios.items() if max(x, 1 / x) > SOLID}:
+    if off := {k: x for k, x in ratios.items() if max(x, 1 / x) > SOLID_INERTIA_RATIO}:
         first, *others = sorted(off, key=lambda k: -abs(np.log(off[k])))
         shown = listing([f"{k} {off[k]:.2g}" for k in (first, *others)], 6)
-        says, expected = f"inertia over a solid body's: {shown}", f"{1 / SOLID:g} to {SOLID:g} for what is not hollow"
+        says, expected = (
+            f"inertia over a solid body's: {shown}",
+            f"{1 / SOLID_INERTIA_RATIO:g} to {SOLID_INERTIA_RATIO:g} for what is not hollow",
+        )
         yield LintFinding(first, "solid body", off[first], expected, LOOK, says, tuple(others))
 
 
@@ -297,7 +300,7 @@ def copied_inertia(at: Judged) -> Iterator[LintFinding]:
     """Find one inertia on several links of different shape or mass."""
     bodies = (body for body in at.bodies if not _placeholder(body))
     for group in by_key((tuple(f"{x + 0.0:.9g}" for x in b.inertia[_UPPER]), b) for b in bodies).values():
-        if len(group) >= COPIES and any(_differ(a, b, at) for a, b in combinations(group, 2)):
+        if len(group) >= MIN_COPIES and any(_differ(a, b, at) for a, b in combinations(group, 2)):
             names = [body.name for body in group]
             says = f"the same inertia on {len(group)} links of different shape or mass: {listing(names, 6)}"
             expected = "an inertia for each shape"
@@ -305,12 +308,12 @@ def copied_inertia(at: Judged) -> Iterator[LintFinding]:
 
 
 def _differ(a: Body, b: Body, at: Judged) -> bool:
-    if not np.isclose(a.mass, b.mass, rtol=MIRRORED):
+    if not np.isclose(a.mass, b.mass, rtol=MIRRORED_ERROR):
         return True
     if a.name not in at.shapes or b.name not in at.shapes:
         return False
     one, other = (np.linalg.eigvalsh(at.shapes[x.name].hull.inertia / at.shapes[x.name].hull.mass) for x in (a, b))
-    return bool(np.maximum(one / other, other / one).max() > OTHER_SHAPE)
+    return bool(np.maximum(one / other, other / one).max() > OTHER_SHAPE_RATIO)
 
 
 # Links and their neighbours
@@ -328,16 +331,25 @@ def neighbours(at: Judged) -> Iterator[LintFinding]:
     for name, others in near.items():
         mass, some = masses[name], [*others, usual]
         ratio = max(min(some) / mass, mass / max(some))
-        if ratio > APART and name not in at.shapes:
+        if ratio > NEIGHBOUR_MASS_RATIO and name not in at.shapes:
             says = f"{mass:.3g} kg beside {min(others):.3g} kg, and {usual:.3g} kg as the median link"
-            yield LintFinding(name, "neighbours", ratio, f"ratios up to {APART:g}", _confidence(ratio / APART), says)
+            yield LintFinding(
+                name,
+                "neighbours",
+                ratio,
+                f"ratios up to {NEIGHBOUR_MASS_RATIO:g}",
+                _confidence(ratio / NEIGHBOUR_MASS_RATIO),
+                says,
+            )
     lengths = {j.name: float(np.linalg.norm(j.translation)) for j in at.links.joints}
     usual = float(np.median([x for x in lengths.values() if x > 0] or [0]))
     for name, length in lengths.items():
-        if usual and length > FAR * usual:
+        if usual and length > NEIGHBOUR_DISTANCE_RATIO * usual:
             says = f"its joint stands {length:.3g} m away, the median one {usual:.3g} m"
-            times = length / usual / FAR
-            yield LintFinding(name, "neighbours", length, f"up to {FAR * usual:.3g} m", _confidence(times), says)
+            times = length / usual / NEIGHBOUR_DISTANCE_RATIO
+            yield LintFinding(
+                name, "neighbours", length, f"up to {NEIGHBOUR_DISTANCE_RATIO * usual:.3g} m", _confidence(times), says
+            )
 
 
 _LEFT: Final = re.compile(
@@ -370,7 +382,7 @@ def mirror(at: Judged) -> Iterator[LintFinding]:
     for a, b, names in odd:
         if len(names) <= 2 or rule:
             says = f"mirrors {a.name} but for {', '.join(names)}"
-            expected = f"a mirror image, to {MIRRORED:.0%}"
+            expected = f"a mirror image, to {MIRRORED_ERROR:.0%}"
             confidence = LIKELY if rule else LOOK
             yield LintFinding(b.name, "mirror", len(names), expected, confidence, says, (a.name,))
 
@@ -384,7 +396,7 @@ def _unlike(a: Body, b: Body) -> list[str]:
     for s in _REFLECTIONS:
         com, inertia = s * a.com - b.com, (np.outer(s, s) * a.inertia - b.inertia)[_UPPER]
         off = [abs(a.mass / b.mass - 1), *(np.abs(com) / (2 * radius or 1.0)), *(np.abs(inertia) / (trace or 1.0))]
-        these = [name for name, x in zip(names, off, strict=True) if x > MIRRORED]
+        these = [name for name, x in zip(names, off, strict=True) if x > MIRRORED_ERROR]
         best = these if best is None or len(these) < len(best) else best
     return best or []
 
@@ -397,14 +409,14 @@ def limits_in_degrees(at: Judged) -> Iterator[LintFinding]:
     """Find limits of angles beyond two turns, which may be degrees."""
     for joint in at.model.joints:
         for k in joint.type.angular:
-            ends = [float(x) for x in (joint.lower[k], joint.upper[k]) if abs(x) < NO_LIMIT]
+            ends = [float(x) for x in (joint.lower[k], joint.upper[k]) if abs(x) < LEAST_MISSING_LIMIT]
             value = max(map(abs, ends), default=0.0)
-            if value > MOST_TURN:
-                whole = all(abs(x - round(x)) < WHOLE for x in ends)
+            if value > MAX_TURN_RAD:
+                whole = all(abs(x - round(x)) < WHOLE_DEGREE_ERROR for x in ends)
                 says = f"limits {', '.join(f'{x:g}' for x in ends)} rad" + (
                     ", whole numbers as of degrees" if whole else ""
                 )
-                confidence = _confidence(value / MOST_TURN)
+                confidence = _confidence(value / MAX_TURN_RAD)
                 yield LintFinding(joint.name, "limits in degrees", value, "up to two turns", confidence, says)
 
 
@@ -412,7 +424,7 @@ def limits_in_degrees(at: Judged) -> Iterator[LintFinding]:
 def unit_axes(at: Judged) -> Iterator[LintFinding]:
     """Find axes that are not of unit length, which parsers take as directions."""
     for name, length in at.axes.items():
-        if abs(length - 1) > UNIT:
+        if abs(length - 1) > AXIS_LENGTH_ERROR:
             says = f"axis of length {length:.3g}"
             yield LintFinding(name, "unit axes", length, "length 1", LOOK, says)
 

@@ -14,8 +14,8 @@ from mbkit.load.shapes import MassProperties
 from mbkit.show.surfaces import Indices
 from mbkit.show.visuals import Shape
 
-#: Of a hull that is a plane or a line, as part of its extent.
-_FLAT: Final = 1e-9
+#: Volume of a hull that is a plane or a line, over the cube of its extent.
+_FLAT_RATIO: Final = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ def _hull(V: Array) -> ConvexHull | None:
         hull = ConvexHull(V)
     except (QhullError, ValueError):
         return None
-    return hull if hull.volume > _FLAT * extent**3 else None
+    return hull if hull.volume > _FLAT_RATIO * extent**3 else None
 
 
 def _outward(hull: ConvexHull) -> MassProperties:

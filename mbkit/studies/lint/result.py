@@ -18,8 +18,8 @@ LOOK: Final = "look"
 SURENESS: Final = (SURE, LIKELY, LOOK)
 _STYLES: Final[dict[str, Style]] = {SURE: "bad", LIKELY: "allowed", LOOK: "muted"}
 #: Parts of one finding that are named.
-_NAMED: Final = 3
-#: What is never judged, since nothing in the file contradicts it.
+_MAX_NAMES: Final = 3
+#: Facts that are never judged, since nothing in the file contradicts them.
 UNSEEN: Final = "what one file cannot show: the sign of an axis, the mass of the whole, where a joint's zero is"
 
 
@@ -84,7 +84,7 @@ class LintResult(ResultTable):
         """Return the document of the findings; parts with the same finding share a line."""
         groups = by_key(((row.check, row.confidence, row.message, row.expected), row) for row in self.rows)
         columns = (
-            Column("link or joint", lambda rows: Span(listing([row.part for row in rows], _NAMED), "mono")),
+            Column("link or joint", lambda rows: Span(listing([row.part for row in rows], _MAX_NAMES), "mono")),
             Column("check", lambda rows: rows[0].check),
             Column("", lambda rows: Span(rows[0].confidence, _STYLES[rows[0].confidence])),
             Column("found", lambda rows: rows[0].message, fill=True),
