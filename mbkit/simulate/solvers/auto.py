@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -154,10 +154,22 @@ class Segment:
     note: str = ""
 
 
-def limit_rounds(attempts: StepAttempts, controllers: Sequence[SwitchingController]) -> None:
-    """Limit the attempts to the next check of any of the trajectories."""
-    if attempts.rounds > 1:
-        attempts.rounds = max(2, min(ROUNDS, *(controller.missing for controller in controllers)))
+def march_watched(
+    attempts: StepAttempts, controllers: Sequence[SwitchingController], first: int, report: Callable[[], None]
+) -> None:
+    """Take trajectories from stop `first` on to the end, or to where another method goes on."""
+
+    def to_next_check(places: Iterable[int]) -> None:
+        if attempts.rounds > 1:
+            attempts.rounds = max(2, min(ROUNDS, *(controllers[place].missing for place in places)))
+
+    to_next_check(range(len(controllers)))
+    for accepted in march(attempts, [x.record for x in controllers], controllers[0].context.stops, first):
+        for place, steps in accepted:
+            if controllers[place].leaves(attempts, place, steps):
+                attempts.drop(place)
+        to_next_check(place for place, _ in accepted)
+        report()
 
 
 class SwitchingController:
@@ -165,7 +177,7 @@ class SwitchingController:
 
     def __init__(self, context: AutoContext, index: int) -> None:
         problem = context.problem
-        self._context, self._index, self._user = context, index, problem.tolerances
+        self.context, self._index, self._user = context, index, problem.tolerances
         self.record = TrajectoryRecord(problem, index, context.space)
         self.doubt = ""
         # The first is the user's or loosened, the second for the number of steps.
@@ -192,19 +204,19 @@ class SwitchingController:
     @property
     def _first(self) -> int:
         # Later after each return, so that the methods do not take turns for ever.
-        return self._context.check << 2 * (self._returns if self._method == EXPLICIT else 0)
+        return self.context.check << 2 * (self._returns if self._method == EXPLICIT else 0)
 
     @property
     def _rest(self) -> float:
-        return self._context.problem.end - self._at[0]
+        return self.context.problem.end - self._at[0]
 
     @property
     def _over(self) -> bool:
-        return self.record.ended != "finished" or self.record.reached >= self._context.problem.end
+        return self.record.ended != "finished" or self.record.reached >= self.context.problem.end
 
     @property
     def _interval(self) -> int:
-        return self._context.problem.interval(self._at[0])
+        return self.context.problem.interval(self._at[0])
 
     def leaves(self, attempts: StepAttempts, place: int, steps: AcceptedSteps) -> bool:
         """Add accepted steps; return whether another method goes on from their end."""
@@ -225,17 +237,12 @@ class SwitchingController:
             ahead, self._ahead = self._ahead, []
             within = partial(attempts.within, 0)
             if all(self.record.take(steps, within) and not self.leaves(attempts, 0, steps) for steps in ahead):
-                limit_rounds(attempts, [self])
-                for (_, steps), *_ in march(attempts, [self.record], self._context.stops, self._interval):
-                    if self.leaves(attempts, 0, steps):
-                        attempts.drop(0)
-                    limit_rounds(attempts, [self])
-                    report()
+                march_watched(attempts, [self], self._interval, report)
 
     def _started(self, method: str) -> StepAttempts:
         """Return step attempts of a method that begin here."""
         t, q, w = self._at
-        attempts = self._context.make(method, loosest(method, self._base))
+        attempts = self.context.make(method, loosest(method, self._base))
         attempts.start([self._index], q[None], w[None], t, 0.0)
         return attempts
 
@@ -245,7 +252,7 @@ class SwitchingController:
 
     def _check_stiff(self, attempts: StepAttempts, place: int, monitor: StepRateMonitor) -> None:
         """Check whether rodas5 shall take over."""
-        rate, step, check = monitor.rate(), monitor.step(), self._context.check
+        rate, step, check = monitor.rate(), monitor.step(), self.context.check
         to_come = rate * self._rest
         if to_come >= _MIN_COSTS_AHEAD * check and step:
             rates = self._spectrum(attempts, place)
@@ -270,7 +277,7 @@ class SwitchingController:
         if trial.rounds > 1:
             trial.rounds = _TRIAL_STEPS
         try:
-            trial.hold(self._interval, self._context.stops[self._interval])
+            trial.hold(self._interval, self.context.stops[self._interval])
             while count < _TRIAL_STEPS and (accepted := trial.advance()):
                 ahead.append(accepted[0][1])
                 monitor.saw(ahead[-1])
@@ -289,7 +296,7 @@ class SwitchingController:
         """Check whether rk853 shall take over again."""
         rate = monitor.rate()
         to_come = rate * self._rest
-        if to_come >= _MIN_COSTS_AHEAD * self._context.check:
+        if to_come >= _MIN_COSTS_AHEAD * self.context.check:
             rates = self._spectrum(attempts, place)
             if rates is not None and rates.stable < self._kept * rate:
                 self._returns += 1
@@ -301,7 +308,7 @@ class SwitchingController:
         """Return the rates of the linearized motion; None where they are not finite."""
         _, q, w = self._at
         try:
-            J = linearized(self._context.space, q, w, partial(attempts.rates, place))
+            J = linearized(self.context.space, q, w, partial(attempts.rates, place))
             return stiffness_of(J, 0.0, exact=False)
         except (NumericalError, FunctionError):
             return None
@@ -313,7 +320,7 @@ class SwitchingController:
         """
         steps = max(1.0, min(to_come, _CHECK_GROWTH * self._tries))
         share = loosest(method, self._base).rtol / self._base.rtol
-        return min(share, _MAX_ERROR_SUM / (steps * math.sqrt(2 * self._context.space.nv)))
+        return min(share, _MAX_ERROR_SUM / (steps * math.sqrt(2 * self.context.space.nv)))
 
     def _adapt_tolerance(self, attempts: StepAttempts, place: int, to_come: float) -> None:
         """Adapt the tolerance to the number of steps to come."""
@@ -347,7 +354,7 @@ class SwitchingController:
 
     def _rounding_noise(self, attempts: StepAttempts, place: int, step: float) -> tuple[float, float]:
         """Return the part of rounding in a step's estimated error, beside the tolerance, and in accelerations."""
-        (_, q, w), space = self._at, self._context.space
+        (_, q, w), space = self._at, self.context.space
         try:
             k = attempts.rates(place, q[None], w[None])
             ahead = _NOISE_SPAN * step * _NOISE_PLACES
@@ -399,13 +406,7 @@ def run_auto(problem: IntegrationProblem) -> SolverResult:
     def to_end(group: Sequence[TrajectoryRecord], report: Callable[[], None]) -> None:
         # Explicitly side by side; what leaves that one by one.
         own = [controllers[record.index] for record in group]
-        limit_rounds(explicit, own)
-        for accepted in march(explicit, group, context.stops):
-            for place, steps in accepted:
-                if own[place].leaves(explicit, place, steps):
-                    explicit.drop(place)
-            limit_rounds(explicit, [own[place] for place, _ in accepted])
-            report()
+        march_watched(explicit, own, 0, report)
         for controller in own:
             controller.alone(report)
 

@@ -12,12 +12,10 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.codegen.taylor import Precision, TaylorSystem, precision, taylor_system
-from mbkit.engines.base import at_time
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.engines.oracle import OracleDynamics
-from mbkit.errors import NumericalError
 from mbkit.methods.registry import ADAPTIVE_METHOD
-from mbkit.model.manifold import magnitude, unit_quaternions
+from mbkit.model.manifold import magnitude
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
 from mbkit.simulate.solvers.step_attempts import AcrossPoses
@@ -28,7 +26,7 @@ from mbkit.simulate.solvers.trajectory_record import (
     diverged,
     run_each,
 )
-from mbkit.simulate.solvers.vector_field import BLAMELESS, DIVERGED, Rates, is_bounded
+from mbkit.simulate.solvers.vector_field import DIVERGED, Rates, is_bounded
 
 #: Smallest jump of a rate, relative to the largest or 1: no truncation of a series makes one.
 _MIN_RATE_JUMP: Final = 1e-6
@@ -52,13 +50,16 @@ def run_taylor(problem: IntegrationProblem) -> SolverResult:
         def walk(i: int, y: Array, record: TrajectoryRecord) -> Iterator[tuple[float, Array, Any]]:  # noqa: ARG001
             member = problem.member(i)
             own: Any = dyn if member is None else dyn._of_samples([member])
-            settled = None if across is None else Rates(own).settled
+            rates = Rates(own)
             behind = (
                 kind.array(*own.constant_values) if dyn._significand_bits > 53 else own._parameter_values.reshape(-1)
             )
             if across is not None:
                 across.follow(i)
-            steps, held = TaylorSteps(system, integrator, kind, behind, settled, across), torque.of_member(member)
+            steps, held = (
+                TaylorSteps(system, integrator, kind, behind, None if across is None else rates.settled, across),
+                torque.of_member(member),
+            )
 
             def force(k: int) -> Any:
                 problem.sample(i, k, steps.t, rounded(steps.y))
@@ -71,22 +72,11 @@ def run_taylor(problem: IntegrationProblem) -> SolverResult:
                 if error.ended != "diverged" or steps.crossed:
                     raise
                 last = held(problem.interval(steps.t))
-                raise diverged(_reason(own, steps.t, rounded(steps.y), last)) from None
+                rates(steps.t, rounded(steps.y), last)
+                raise diverged(rates.why) from None
 
         records = run_each(problem, walk)
     return assemble_result(problem, records, evaluations=sum(record.steps for record in records))
-
-
-def _reason(dyn: LagrangianDynamics | OracleDynamics, t: float, y: Array, force: Any) -> str:
-    """Return why there is no step from the last good state, in the engine's words if it has some."""
-    nq = dyn.model.nq
-    if np.abs(y).max() < BLAMELESS:
-        try:
-            # One of a batch with parameters of its own is a batch of one.
-            at_time(dyn, t).forward_dynamics(unit_quaternions(dyn.model, y[:nq])[0], y[nq:], force)
-        except NumericalError as error:
-            return str(error)
-    return DIVERGED
 
 
 def rounded(y: Any) -> Array:

@@ -237,14 +237,6 @@ class TrajectoryRecord(RunRecord):
         if len(t):
             self._kept.append((t, q, v))
 
-    def reach(self, t: float, y: Array) -> None:
-        """Go on to a state (q, v), of a solver that does not tell its steps."""
-        self.reached, nq = t, self._model.nq
-        if self.passed is not None:
-            self.passed.saw(t, y[:nq])
-        if self._save is not None and t in self._save:
-            self.keep(np.array([t]), *self._state(y[None, :nq], y[None, nq:]))
-
     def _state(self, q: Array, w: Array) -> tuple[Array, Array]:
         """Return q and mbkit's v."""
         if self._space is not None:
@@ -337,8 +329,7 @@ def run_each(
 ) -> list[TrajectoryRecord]:
     """Integrate the states y = (q, v) one by one.
 
-    walk(i, y, record) yields the end of each step as (t, y, at), with at(t) -> y within the step. Where at is None it
-    yields saved states, and counts its steps in the record.
+    walk(i, y, record) yields the end of each step as (t, y, at), with at(t) -> y within the step.
     """
     records, nq = [], problem.dyn.model.nq
     for i, y in enumerate(problem.y):
@@ -348,13 +339,10 @@ def run_each(
             record.begin(unit_quaternions(problem.dyn.model, y[:nq])[0], y[nq:])
             t = problem.start
             for t1, y1, at in walk(i, y, record):
-                if at is None:
-                    record.reach(t1, y1)
-                else:
-                    both = np.array([y, y1])
-                    accepted = AcceptedSteps(np.array([t, t1]), both[:, :nq], both[:, nq:])
-                    if not record.take(accepted, _by_rows(at, nq)) or record.crawls():
-                        break
+                both = np.array([y, y1])
+                accepted = AcceptedSteps(np.array([t, t1]), both[:, :nq], both[:, nq:])
+                if not record.take(accepted, _by_rows(at, nq)) or record.crawls():
+                    break
                 report(t1)
                 t, y = t1, y1
         except StoppedError as error:
