@@ -332,13 +332,16 @@ class Torque:
         if callable(torque):
             functions.append((slice(0, model.nv), TorqueCallback(torque, model.nv)))
         elif torque is not None:
-            parts.append((slice(0, model.nv), _read(torque, model, batch, steps)))
+            about = f"{model.name} has nv = {model.nv}"
+            parts.append((slice(0, model.nv), _read("torque", torque, model.nv, batch, steps, about)))
         for frame, wrench in (wrenches or {}).items():
             part, size = slice(size, size + 6), size + 6
+            name = f"wrench on {frame!r}"
             if callable(wrench):
-                functions.append((part, TorqueCallback(wrench, 6, f"wrench on {frame!r}")))
+                functions.append((part, TorqueCallback(wrench, 6, name)))
             else:
-                parts.append((part, _read_wrench(f"wrench on {frame!r}", wrench, batch, steps)))
+                about = "force and moment are six numbers"
+                parts.append((part, _read(name, wrench, 6, batch, steps, about, each=True)))
         #: Whether the force jumps between steps.
         self.held = any(x.ndim > 1 and (x.shape[:-1] != (batch, 1) or steps == 1) for _, x in parts)
         #: Rows that are held, one for each step, or sample, or one for all: (rows, n), or (N, rows, n).
@@ -522,38 +525,28 @@ class Torque:
         return held if self.held or held.rows.any() else None
 
 
-def _read(torque: ArrayLike, model: Model, batch: int | None, steps: int | None) -> Array:
-    """Return an array of torques, checked."""
-    allowed = [(model.nv,), (steps, model.nv), (batch, steps, model.nv)][
-        : 1 if steps is None else 2 + (batch is not None)
-    ]
-    shape = _shape("torque", torque)
-    if shape not in allowed:
-        raise InputError(
-            f"torque: expected shape {' or '.join(map(str, allowed))}, got {shape}; {model.name} has nv = {model.nv}"
-            + _why(steps)
-        )
-    return finite_array("torque", torque, shape)
+def _read(
+    name: str, value: ArrayLike, size: int, batch: int | None, steps: int | None, about: str, *, each: bool = False
+) -> Array:
+    """Return an array of a force, checked; one row for each trajectory becomes (batch, 1, size).
 
-
-def _read_wrench(name: str, wrench: ArrayLike, batch: int | None, steps: int | None) -> Array:
-    """Return an array of a wrench, checked, (6,), (steps, 6), (batch, steps, 6) or one row each, (batch, 1, 6)."""
-    shape, each, held = _shape(name, wrench), (batch, 6), (steps, 6)
-    allowed: list[tuple[int | None, ...]] = [(6,)]
-    allowed += [] if batch is None else [each]
-    allowed += [] if steps is None else [held]
-    allowed += [] if batch is None or steps is None else [(batch, steps, 6)]
+    `each` is whether each trajectory may have one row, (batch, size).
+    """
+    shape, held = _shape(name, value), (steps, size)
+    one = (batch, size) if each else (None,)
+    allowed = [x for x in ((size,), one, held, (batch, steps, size)) if None not in x]
     if shape not in allowed:
+        why = f" and the run has {steps} steps"
+        if steps is None:
+            why = "; one row per interval needs save=, times from 0 to the end of the run"
+        raise InputError(f"{name}: expected shape {' or '.join(map(str, allowed))}, got {shape}; {about}{why}")
+    if shape == one == held and batch != 1:
         raise InputError(
-            f"{name}: expected shape {' or '.join(map(str, allowed))}, got {shape}; force and moment are six numbers"
-            + _why(steps)
+            f"{name}: shape {shape} may be one row for each trajectory or for each step; "
+            f"give ({batch}, {steps}, {size})"
         )
-    if shape == each == held and batch != 1:
-        raise InputError(
-            f"{name}: shape {shape} may be one row for each trajectory or for each step; give ({batch}, {steps}, 6)"
-        )
-    array = finite_array(name, wrench, shape)
-    return array[:, None] if shape == each else array
+    array = finite_array(name, value, shape)
+    return array[:, None] if shape == one else array
 
 
 def _shape(name: str, value: ArrayLike) -> tuple[int, ...]:
@@ -561,9 +554,3 @@ def _shape(name: str, value: ArrayLike) -> tuple[int, ...]:
         return np.shape(value)
     except ValueError:
         raise InputError(f"{name}: expected an array or a callable, got rows of different lengths") from None
-
-
-def _why(steps: int | None) -> str:
-    if steps is None:
-        return "; one row per interval needs save=, times from 0 to the end of the run"
-    return f" and the run has {steps} steps"
