@@ -30,6 +30,10 @@ _ROTOR: Final = Joint.adding_to("T")[0]
 _BOUND: Final = ("friction", "stiction")
 #: A force at rest is above its bound where it is so by more than this part, as rounding of its sums may be.
 ROUNDING: Final = 1e-13
+#: Velocities that follow from others by rows, relative to these, that are rounding of a pose.
+POSE_ROUNDING: Final = 1e-9
+#: Speed, m/s or rad/s, of what has stopped: below every rounding, and above what a drive that has ended leaves.
+STOPPED: Final = float(np.finfo(float).eps) ** 2
 
 
 class FrictionNumbers(NamedTuple):

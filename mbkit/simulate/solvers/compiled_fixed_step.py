@@ -133,7 +133,7 @@ def run_rollout(
     """Step one state or a batch over the grid; no number depends on `workers`, by default one for each core.
 
     `behind` are parts that follow each step, of which each trajectory has what they `read`, (N, rows), by name;
-    `margins`, (N, steps), takes what they write of that name.
+    `margins`, (N, steps), takes what they write of that name, NaN where they do not follow.
     """
     dyn, method, grid = problem.dyn, problem.method, problem.grid
     assert isinstance(dyn, LagrangianDynamics)
@@ -195,6 +195,8 @@ def run_rollout(
             suspects = suspects_of(suspects, thorough=True)
         if len(suspects):
             # Near a singular pose steps are of collocation, and the pose is named. The others of a batch are done.
+            if margins is not None:
+                margins[suspects] = np.nan
             return run_fixed(problem, record, suspects)
     if len(suspects):
         plan = dyn._step_plan(method, fed=law is not None)

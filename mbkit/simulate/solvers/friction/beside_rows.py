@@ -18,9 +18,8 @@ from mbkit._check import Array
 from mbkit._reproducible import pivoted
 from mbkit.engines.elements.dry_friction import Mask
 from mbkit.errors import NumericalError
+from mbkit.model.changes.dry_friction import POSE_ROUNDING
 
-#: Entries of N, and parts of them, that are rounding of a pose.
-_ROUNDED: Final = 1e-9
 #: Part of a motion that is left where it stops, by the rounding of late times; at a dead centre all of it is.
 _LEFT: Final = 1e-3
 #: Acceleration, relative to speeds of 1 or more: a speed that fades as c s², s before its end, is zero by rounding from
@@ -30,32 +29,32 @@ _FADED: Final = 8 * float(np.sqrt(np.finfo(float).eps))
 
 def slow(v: Array) -> Array:
     """Return the speed up to which a joint may be at rest by rounding, (1,) or (N, 1)."""
-    return np.asarray(_ROUNDED * np.maximum(1.0, np.abs(v).max(axis=-1, keepdims=True, initial=0.0)))
+    return np.asarray(POSE_ROUNDING * np.maximum(1.0, np.abs(v).max(axis=-1, keepdims=True, initial=0.0)))
 
 
 def fades(N: Array, v: Array, a: Array) -> Mask:
     """Return which joints without velocity the rows alone move, and do not but by rounding of their end, (..., nv)."""
     size = np.maximum(1.0, np.abs(v).max(axis=-1, keepdims=True, initial=0.0))
-    return np.asarray((np.linalg.norm(N, axis=-1) < _ROUNDED) & (np.abs(a) <= _FADED * size))
+    return np.asarray((np.linalg.norm(N, axis=-1) < POSE_ROUNDING) & (np.abs(a) <= _FADED * size))
 
 
 def independent(N: Array, still: Mask) -> Mask:
     """Return as many of the joints at rest, (nv,), as rest in independent ways by N, (nv, k)."""
     out, at = np.zeros(still.shape, dtype=bool), np.flatnonzero(still)
     if len(at):
-        out[at[pivoted(N[at], _ROUNDED)[0]]] = True
+        out[at[pivoted(N[at], POSE_ROUNDING)[0]]] = True
     return out
 
 
 def stopped(N: Array, v: Array, rests: Mask, rubs: Mask) -> Array:
     """Return the velocity at which some joints have come to rest: so do those that can rest with them alone, (nv,)."""
     U, s, Vt = np.linalg.svd(N[rests], full_matrices=False)
-    speeds = (U.T @ v[rests]) / np.where(s > _ROUNDED, s, np.inf)
+    speeds = (U.T @ v[rests]) / np.where(s > POSE_ROUNDING, s, np.inf)
     # A joint at its dead centre turns there, while the others go on.
-    known = (s > _ROUNDED) & (np.abs(speeds) <= _LEFT * max(1.0, float(np.abs(v).max())))
+    known = (s > POSE_ROUNDING) & (np.abs(speeds) <= _LEFT * max(1.0, float(np.abs(v).max())))
     along = N @ Vt[known].T
     out: Array = v - along @ speeds[known]
-    held = np.linalg.norm(N, axis=1) ** 2 - np.linalg.norm(along, axis=1) ** 2 < _ROUNDED
+    held = np.linalg.norm(N, axis=1) ** 2 - np.linalg.norm(along, axis=1) ** 2 < POSE_ROUNDING
     return np.where(rests | (held & rubs & (np.abs(out) <= slow(v))), 0.0, out)
 
 
@@ -74,7 +73,7 @@ def shares(N: Array, needed: Array, bound: Array, still: Mask, locked: Mask) -> 
     # Velocities of what rests by those of what is locked, and the forces that would do there alone.
     R = N[:, own] @ ways
     alone = np.einsum("mkd,mnk,mn->md", ways, N, needed)
-    R = np.where(np.abs(R) > _ROUNDED, R, 0.0)
+    R = np.where(np.abs(R) > POSE_ROUNDING, R, 0.0)
     linked = (R != 0).any(axis=0)
     size, label = connected_components(linked.T.astype(int) @ linked.astype(int))
     for part in range(size):
@@ -104,7 +103,7 @@ def _least(G: Array, needed: Array) -> Array:
     # The dual is the motion in which they let go. It tells how each of them moves, however small its bound is.
     x, y = found.x[:n] * (size / largest), found.eqlin.marginals
     moves = G @ y
-    turns = np.abs(moves) > _ROUNDED * np.linalg.norm(G, axis=1) * np.linalg.norm(y)
+    turns = np.abs(moves) > POSE_ROUNDING * np.linalg.norm(G, axis=1) * np.linalg.norm(y)
     most = (needed @ y) / np.abs(moves).sum()
     x = np.where(turns, np.copysign(most, moves), x)
-    return np.asarray(np.where(np.abs(x) < (1 - _ROUNDED) * most, x, np.copysign(most, x)))
+    return np.asarray(np.where(np.abs(x) < (1 - POSE_ROUNDING) * most, x, np.copysign(most, x)))

@@ -12,13 +12,14 @@ from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize.elementwise import find_root
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
+from mbkit.engines.elements.dry_friction import Mask
 from mbkit.errors import FunctionError, NumericalError
 from mbkit.methods.registry import method_of
+from mbkit.model.changes.dry_friction import STOPPED
 from mbkit.model.integration_space import Space
 from mbkit.simulate.events import Hit
 from mbkit.simulate.problem import IntegrationProblem
@@ -42,6 +43,8 @@ _MOST_STATES: Final = 2**16
 _EPS: Final = float(np.finfo(float).eps)
 #: Fraction of a step before which the end of a phase is not searched.
 _FROM: Final = 1e-6
+#: Of a time, what is left of a step whose phase ends with it.
+_TIMES: Final = 4 * _EPS
 
 
 def run_fixed_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics], Solver]) -> SolverResult:
@@ -117,7 +120,7 @@ class _Members:
         dyn = self.friction.dyn._of_samples(self.members) if self.side_by_side else self.friction.dyn
         self.v = self.friction.stopped(dyn, start, self.q, self.v, self.v == 0)
         self._phase = self.begin(rows, start)
-        self._shortest = max(_BLOCK, _SET_UP // len(rows) if self._steps_compiled(self._phase.dyn) else 0)
+        self._shortest = max(_BLOCK, _SET_UP // len(rows) if self._compiled(self._phase.dyn) else 0)
         self._window, parts = self._shortest, len(self.problem.q) // len(self.k)
         while self.error is None and self._going.any():
             self._block()
@@ -218,7 +221,7 @@ class _Members:
             # One alone has the margins of its states side by side, behind the steps.
             times: Any = start + np.arange(1, q.shape[1]) * h
             margins = self._margins_of(phase, times, q[0, 1:], v[0, 1:])
-        good = self._good(rows, phase, q, v, limit, start, h) if margins is None else _first(margins < 0, limit)
+        good = self._good(rows, phase, q, v, margins, limit, start, h)
         self._window = self._next_window(good, good < limit)
         record, first = self._record, int(k[0])
         if (k == first).all() and (good == n).all():
@@ -252,16 +255,12 @@ class _Members:
             self._lose(rows[(good == limit) & (limit < np.minimum(left, n))], result)
             self._across(rows[good < limit])
 
-    def _next_window(self, good: Indices, changed: NDArray[np.bool_]) -> int:
+    def _next_window(self, good: Indices, changed: Mask) -> int:
         """Return the steps of the next block: more where few phases end, as steps behind an end are in vain."""
         return int(np.clip(_GROWTH * good.mean() * (1 - changed.mean()) ** 3, self._shortest, _MOST_STATES))
 
     def _compiled(self, dyn: Dynamics) -> bool:
         """Return whether the margins of states are machine code with the steps."""
-        # Beside constraints, forces at rest are shared by what rests together.
-        return self._steps_compiled(dyn) and not dyn.model.constrained
-
-    def _steps_compiled(self, dyn: Dynamics) -> bool:
         known = dyn._derived and method_of(self.problem.method).explicit and not self.problem.torque.callable
         return known and getattr(dyn, "_compiles_steps", False) and getattr(dyn, "device", None) is None
 
@@ -304,20 +303,27 @@ class _Members:
         self._record.doubts += out.doubts
         return out
 
-    def _good(self, rows: Indices, phase: Phase, q: Array, v: Array, limit: Indices, start: float, h: float) -> Indices:
-        """Return how many states behind the first are of the phase."""
-        which = self.friction.which
-        along: Array = np.where(phase.still, 0.0, phase.sides)[:, None, which] * v[:, 1:, which]
-        good = _first(np.any(along < 0, axis=2), limit)
-        counts = np.where(phase.still.any(axis=1), good, 0)
-        if counts.any():
-            row = np.repeat(np.arange(len(good)), counts)
-            step = np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
-            states = row, step + 1
-            margins = self._of_states(rows, phase, row, step, start + (step + 1) * h, q[states], v[states])
-            over = (margins < 0).any(axis=1)
-            np.minimum.at(good, row[over], step[over])
-        return np.asarray(good)
+    def _good(
+        self,
+        rows: Indices,
+        phase: Phase,
+        q: Array,
+        v: Array,
+        margins: Array | None,
+        limit: Indices,
+        start: float,
+        h: float,
+    ) -> Indices:
+        """Return how many states behind the first are of the phase, by their margins as far as these are known."""
+        if margins is None:
+            margins = self.friction.speeds(phase, v[:, 1:]).min(axis=2, initial=1.0)
+            margins = np.where(phase.still.any(axis=1, keepdims=True) & (margins >= 0), np.nan, margins)
+        good = _first(margins < 0, limit)
+        row, step = np.nonzero(np.asarray(np.isnan(margins) & (np.arange(margins.shape[1]) < good[:, None])))
+        if len(row):
+            states, t = (row, step + 1), np.asarray(start + (step + 1.0) * h, dtype=np.float64)
+            margins[row, step] = self._of_states(rows, phase, row, step, t, q[states], v[states]).min(axis=1)
+        return _first(margins < 0, limit)
 
     def _lose(self, rows: Indices, result: SolverResult) -> None:
         self._going[rows] = False
@@ -341,19 +347,21 @@ class _Members:
         while len(rows):
             part, every = _PartOfStep(self, rows, phase, start), np.arange(len(rows))
             q, v, margins = part.ahead(every, left)
-            over = margins < 0
+            over = (margins < 0) & (left > _TIMES * np.abs(start + left))
             self.q[rows[~over]], self.v[rows[~over]] = q[~over], v[~over]
             for kept, x in zip(self._phase.pattern, phase.pattern, strict=True):
                 kept[rows[~over]] = x[~over]
             rows, start, left, every = rows[over], start[over], left[over], every[over]
             if not len(rows):
                 break
-            s = part.ends(every, left, margins[over])
+            s, faded = part.ends(every, left, margins[over])
             q, v, _ = part.ahead(every, s)
             self._record.steps += len(rows)
             moved = s >= _FROM * left
             start, left = start + s, left - s
-            phase, decided = self._following(rows, phase.take(every), start, (q, v), moved, s > 0)
+            # A drive that has ended by the end of the step does so within rounding where its speed is zero first.
+            later = start + np.where(faded, left, 0.0)
+            phase, decided = self._following(rows, phase.take(every), start, later, (q, v), moved, s > 0)
             if not decided.all():
                 rows, start, left = rows[decided], start[decided], left[decided]
                 phase = phase.take(np.flatnonzero(decided))
@@ -367,16 +375,16 @@ class _Members:
         rows: Indices,
         before: Phase,
         t: Array,
+        later: Array,
         state: tuple[Array, Array],
-        moved: NDArray[np.bool_],
-        pushed: NDArray[np.bool_],
-    ) -> tuple[Phase, NDArray[np.bool_]]:
-        """Go to the ends of phases; return the next ones, and which of them can be decided.
+        moved: Mask,
+        pushed: Mask,
+    ) -> tuple[Phase, Mask]:
+        """Go to the ends of phases at t; return the next ones, as it is `later`, and which of them can be decided.
 
         `moved` tells that time has passed, `pushed` that it has at least begun to.
         """
-        when = self.times(t)
-        v, leaving = self.friction.after(before, when, *state, self.forces(rows))
+        v, leaving = self.friction.after(before, self.times(t), *state, self.forces(rows))
         self._empty[rows] = np.where(moved, 0, self._empty[rows] + 1)
         decided = self._empty[rows] <= MAX_EMPTY_PHASES
         self._going[rows] = decided
@@ -385,7 +393,7 @@ class _Members:
             self.early[int(self.members[i])] = "step_too_small", why
         self.q[rows], self.v[rows] = state[0], v
         # What let go and came to rest at once did not let go.
-        after = self.begin(rows, when, leaving * (moved | pushed)[:, None])
+        after = self.begin(rows, self.times(later), leaving * (moved | pushed)[:, None])
         for i, name in self.friction.changes(before, after):
             if decided[i]:
                 row = rows[i]
@@ -437,8 +445,9 @@ class _PartOfStep:
         q, v = run.q[self._rows[i]], run.v[self._rows[i]]
         if self._values is not None:
             given = q, v, force, s[:, None], self._bound[i], self._values[i]
-            arrays, _ = self._code.everything(*given, threads=self._threads)
-            return *run.friction.held(phase.still, q, arrays["q1"], arrays["v1"]), arrays["margin1"][:, 0]
+            arrays, finite = self._code.everything(*given, threads=self._threads)
+            if finite:
+                return *run.friction.held(phase.still, q, arrays["q1"], arrays["v1"]), arrays["margin1"][:, 0]
         ends = q.copy(), v.copy()
         for j in np.flatnonzero(s > 0):
             own, one = phase.take(np.array([j])), slice(j, j + 1)
@@ -453,8 +462,11 @@ class _PartOfStep:
         margins = run.friction.margins(phase, run.times(self._t[i] + s), *ends, force).min(axis=1)
         return *run.friction.held(phase.still, q, *ends), margins
 
-    def ends(self, i: Indices, length: Array, over: Array) -> Array:
-        """Return after how many seconds phases end, before `length`, where margins are `over`; 0 if they do at once."""
+    def ends(self, i: Indices, length: Array, over: Array) -> tuple[Array, Mask]:
+        """Return after how many seconds phases end, before `length`, where margins are `over`; 0 if they do at once.
+
+        With them, which end with a speed that is zero by rounding behind `length`, too.
+        """
         first = _FROM * length
         noise = _EPS * (1 + np.abs(self._run.v[self._rows[i]]).max(axis=1))
         soon, now = self.ahead(i, first)[2], np.full(len(i), np.inf)
@@ -464,7 +476,10 @@ class _PartOfStep:
         # What rests at its bound to the last bits, and is pulled more and more, lets go in the next instant.
         at_once = soon <= -noise
         low, high = np.where(at_once, 0.0, first), np.where(at_once, first, length)
-        at_low, at_high = (np.where(at_once, *x) / noise for x in ((now, np.maximum(soon, 2 * noise)), (soon, over)))
+        # A speed that is zero at the end may have faded out long before.
+        faded = over > -noise
+        unit = np.where(faded, STOPPED / 2, noise)
+        at_low, at_high = (np.where(at_once, *x) / unit for x in ((now, np.maximum(soon, 2 * noise)), (soon, over)))
         out = np.zeros(len(i))
         open_ = np.flatnonzero(at_low > 0)
 
@@ -474,7 +489,7 @@ class _PartOfStep:
             inside = np.flatnonzero((x > 0) & (x < 1))
             if len(inside):
                 k = j[inside]
-                known[inside] = self.ahead(i[k], low[k] + x[inside] * (high - low)[k])[2] / noise[k]
+                known[inside] = self.ahead(i[k], low[k] + x[inside] * (high - low)[k])[2] / unit[k]
             return np.asarray(known)
 
         if len(open_):
@@ -482,4 +497,4 @@ class _PartOfStep:
             tolerances = {"xatol": 4 * _EPS, "xrtol": 4 * _EPS, "fatol": 1.0}
             found = find_root(least, ends, args=(open_,), tolerances=tolerances).x
             out[open_] = np.where(np.isfinite(found), low[open_] + found * (high - low)[open_], 0.0)
-        return out
+        return out, faded

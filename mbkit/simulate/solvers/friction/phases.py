@@ -12,7 +12,7 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
 from mbkit.engines.elements.dry_friction import Mask
-from mbkit.model.changes.dry_friction import ROUNDING
+from mbkit.model.changes.dry_friction import ROUNDING, STOPPED
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.simulate.constraint_projection import settled
 from mbkit.simulate.solvers.friction.beside_rows import fades, independent, shares, slow, stopped
@@ -146,17 +146,24 @@ class Friction:
 
         Of one that slides it is the speed, of one that rests the part of its bound that is left, and 1 without a side.
         """
-        out = np.where(phase.sides == 0, 1.0, phase.sides * v)[..., self.which]
+        out = self.speeds(phase, v)
         still = phase.still[..., self.which]
         if still.any():
             held = np.where(phase.still, 0.0, v)
-            used = np.abs(self.holding(phase, t, q, held, force)[..., self.which]) / self.bounds(phase)
+            bound = self.bounds(phase)
+            used = np.abs(self.holding(phase, t, q, held, force)[..., self.which]) / np.where(still, bound, 1.0)
             out = np.where(still, 1 + ROUNDING - used, out)
             if self._bound:
                 # What rows alone hold moves as soon as they do.
                 moved = np.abs(v) / slow(v)
                 out = np.where(still & ~phase.locked[..., self.which], np.minimum(out, 1 - moved[..., self.which]), out)
         return out
+
+    def speeds(self, phase: Phase, v: Array) -> Array:
+        """Return the margins of velocities that slide, and 1 of the others; (k,), (N, k) or (m, N, k)."""
+        along = np.where(phase.still, 0.0, phase.sides)[..., self.which]
+        along = along[:, None] if v.ndim > along.ndim > 1 else along
+        return np.asarray(np.where(along == 0, 1.0, along * v[..., self.which] - STOPPED))
 
     def margin_part(self, dyn: Any) -> Any:
         """Return the least margin as a part behind the steps of a phase's dynamics on the own derivation."""
@@ -190,9 +197,9 @@ class Friction:
         return out
 
     def bounds(self, phase: Phase) -> Array:
-        """Return the largest forces at rest of velocities with friction, 1 where there are none; (k,) or (m, k)."""
+        """Return the largest forces at rest of velocities with friction, (k,) or (m, k)."""
         bound = self._own.law_of(phase.rubbed).bound[..., self.which]
-        return np.broadcast_to(np.where(bound > 0, bound, 1.0), (*phase.still.shape[:-1], len(self.which)))
+        return np.broadcast_to(bound, (*phase.still.shape[:-1], len(self.which)))
 
     def after(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> tuple[Array, Array]:
         """Return the velocity at the end of a phase, zero of what stopped there, and the signs of what lets go.
