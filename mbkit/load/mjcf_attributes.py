@@ -5,13 +5,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -19,7 +21,7 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit._reproducible import length, product
 from mbkit.errors import did_you_mean
-from mbkit.load.xml_reader import MAX_FILE_BYTES, Element, Reader
+from mbkit.load.xml_reader import MAX_FILE_BYTES, Element, Reader, element_text
 from mbkit.model.validation import listing
 
 ORIENTATIONS: Final = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
@@ -55,6 +57,7 @@ class Compiler:
     meshdir: str
     strippath: bool
     alignfree: bool
+    attributes: Mapping[str, str]  # all, as written
 
     @classmethod
     def of(cls, mujoco: Element, read: Reader) -> Compiler:
@@ -90,6 +93,7 @@ class Compiler:
             meshdir=meshdir.replace("\\", "/"),
             strippath=attributes.get("strippath") == "true",
             alignfree=flag("alignfree"),
+            attributes=attributes,
         )
 
     def mesh_path(self, file: str) -> PurePosixPath:
@@ -108,6 +112,29 @@ def mesh_name(mesh: Element) -> str:
     """Return the name of a <mesh>."""
     stem = PurePosixPath(mesh.attributes.get("file", "").replace("\\", "/")).stem
     return mesh.attributes.get("name") or stem
+
+
+def asset_name(content: bytes, path: Path) -> str:
+    """Return a name for a file that is passed on: MuJoCo caches meshes by name, so it stands for the content."""
+    return hashlib.sha256(content).hexdigest() + path.suffix
+
+
+def compiled_model(compiler: Mapping[str, str], inside: str, assets: Mapping[str, bytes]) -> Any:
+    """Return the `MjModel` of an MJCF; ValueError with MuJoCo's reason, without lines, which are those of this text."""
+    # Imported late: few files need the compiler.
+    import mujoco
+
+    text, previous = f"<mujoco>{element_text('compiler', compiler)}{inside}</mujoco>", mujoco.get_mju_user_warning()
+    # Its warnings would be printed, and kept in a file of the working folder.
+    mujoco.set_mju_user_warning(lambda _: None)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            return mujoco.MjModel.from_xml_string(text, assets=dict(assets))
+    except ValueError as error:
+        raise ValueError(re.sub(r",? line -?\d+", "", " ".join(str(error).split()))) from None
+    finally:
+        mujoco.set_mju_user_warning(previous)
 
 
 def read_mesh(path: Path, most: int = MAX_FILE_BYTES) -> tuple[bytes, str]:
@@ -215,6 +242,11 @@ def from_euler(angles: Array, compiler: Compiler) -> Array:
 def has_length(x: Array) -> bool:
     """Return whether a direction can be normalized; the squares of numbers below 1e-162 vanish."""
     return length(x) > 0
+
+
+def matrix_of(wxyz: Any) -> Array:
+    """Return the rotation matrix of a quaternion in MuJoCo's order."""
+    return spatial.matrix_from_quaternion(np.roll(np.asarray(wxyz, dtype=np.float64), -1))
 
 
 def about(axis: Array, angle: float) -> Array:

@@ -6,18 +6,14 @@ their bytes; no other file is opened.
 
 from __future__ import annotations
 
-import hashlib
-import re
-import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from mbkit import spatial
 from mbkit._reproducible import turned
-from mbkit.load.mjcf_attributes import mesh_assets, read_mesh
+from mbkit.load.mjcf_attributes import asset_name, compiled_model, matrix_of, mesh_assets, read_mesh
 from mbkit.load.mjcf_reader import Scene
 from mbkit.load.shapes import MassProperties
 from mbkit.load.xml_reader import Element, element_text
@@ -79,9 +75,7 @@ class _Text:
 
     def __init__(self, mujoco: Element, path: Path, scene: Scene) -> None:
         self.mujoco, self.path, self.scene = mujoco, path, scene
-        self.settings: dict[str, str] = {}
-        for compiler in mujoco.all("compiler"):
-            self.settings.update(compiler.attributes)
+        self.settings = scene.compiler.attributes
         self.counted = {id(geom) for geoms in scene.inferred.values() for geom, _ in geoms}
         self.meshes = mesh_assets(mujoco)
         self.needed: dict[int, dict[str, str]] = {}
@@ -104,24 +98,11 @@ class _Text:
         has_plugin_mesh = any(mesh.first("plugin") for mesh in self.meshes.values() if id(mesh) in self.needed)
         sections = (*sections, "extension") if has_plugin_mesh else sections
         inside = "".join(self._written(e, None) for e in self.mujoco.children if e.tag in sections)
-        text = f"<mujoco>{element_text('compiler', settings)}{inside}</mujoco>"
-        # Imported late: few files need the compiler.
-        import mujoco
-
-        previous = mujoco.get_mju_user_warning()
-        # Its warnings would be printed, and kept in a file of the working folder.
-        mujoco.set_mju_user_warning(lambda _: None)
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)
-                return mujoco.MjModel.from_xml_string(text, assets=self.assets)
+            return compiled_model(settings, inside, self.assets)
         except ValueError as error:
-            # The line is one of the shortened text.
-            listing = re.sub(r",? line -?\d+", "", " ".join(str(error).split()))
-            read.fault(f"{item}: MuJoCo's compiler refuses: {listing}")
+            read.fault(f"{item}: MuJoCo's compiler refuses: {error}")
             return None
-        finally:
-            mujoco.set_mju_user_warning(previous)
 
     def _need(self, name: str, item: str, geom: Element) -> None:
         """Read the file of a mesh, once."""
@@ -143,8 +124,7 @@ class _Text:
             read.fault(f"{item}: {path}: {why}", mesh)
             return
         self.opened.append(str(path.relative_to(folder) if path.is_relative_to(folder) else path))
-        # MuJoCo caches meshes by name, so a name stands for its content.
-        attributes["file"] = hashlib.sha256(content).hexdigest() + path.suffix
+        attributes["file"] = asset_name(content, path)
         self.assets[attributes["file"]] = content
 
     def _written(self, element: Element, childclass: str | None) -> str:
@@ -172,9 +152,8 @@ class _Text:
 
 def _mass_properties(body: Any) -> MassProperties:
     """Return the inertia of a compiled body in its own axes."""
-    w, x, y, z = (float(c) for c in body.iquat)
-    axes = spatial.matrix_from_quaternion(np.array([x, y, z, w]))
-    return MassProperties(float(body.mass[0]), np.array(body.ipos), turned(axes, np.diag(body.inertia)))
+    inertia = turned(matrix_of(body.iquat), np.diag(body.inertia))
+    return MassProperties(float(body.mass[0]), np.array(body.ipos), inertia)
 
 
 def name_list(names: Iterable[str]) -> str:

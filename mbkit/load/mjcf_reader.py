@@ -31,6 +31,7 @@ from mbkit.load.mjcf_attributes import (
     about,
     from_euler,
     has_length,
+    matrix_of,
     mesh_name,
     pose,
 )
@@ -642,8 +643,7 @@ def _inertial_frame(
 
     values, axes, quat = np.zeros(3), np.zeros(9), np.zeros(4)
     mujoco.mju_eig3(values, axes, quat, turned(turned_by.T, matter.inertia).ravel())
-    w, x, y, z = quat
-    return Pose(product(turned_by, spatial.matrix_from_quaternion(np.array([x, y, z, w]))), matter.com)
+    return Pose(product(turned_by, matrix_of(quat)), matter.com)
 
 
 def _joint(element: Element, body: str, X: Pose, childclass: str | None, scene: Scene) -> MjcfJoint:

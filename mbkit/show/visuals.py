@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,7 +14,15 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit.errors import LoadError, UnknownNameError
 from mbkit.load import xml_reader
-from mbkit.load.mjcf_attributes import Compiler, mesh_assets, mesh_name, read_mesh
+from mbkit.load.mjcf_attributes import (
+    Compiler,
+    asset_name,
+    compiled_model,
+    matrix_of,
+    mesh_assets,
+    mesh_name,
+    read_mesh,
+)
 from mbkit.load.mjcf_reader import write_out_attached
 from mbkit.load.shapes import SIZES
 from mbkit.load.xml_reader import Element, Reader, element_text
@@ -226,16 +232,18 @@ def _mjcf(model: _Bodies, source: Path, mujoco: Element, kind: str) -> Visuals:
         if why:
             missing[name] = why
             continue
-        # MuJoCo caches meshes by name, so a name stands for its content.
-        own = hashlib.sha256(content).hexdigest() + path.suffix
+        own = asset_name(content, path)
         assets[own] = content
         mesh.attributes |= {"name": name, "file": own}
     text = "".join(_written(e, missing, out) for e in mujoco.children if e.tag in ("default", "asset", "worldbody"))
     names = {"angle", "eulerseq", "autolimits", "inertiafromgeom", "fitaabb", "boundmass", "boundinertia"}
-    merged = {k: x for e in mujoco.all("compiler") for k, x in e.attributes.items() if k in names}
+    merged = {k: x for k, x in settings.attributes.items() if k in names}
     # A body without mass for want of its mesh compiles, too.
     merged |= {"boundmass": "1e-9", "boundinertia": "1e-9", "balanceinertia": "true"}
-    compiled = _compiled(f"<mujoco>{element_text('compiler', merged)}{text}</mujoco>", assets, source)
+    try:
+        compiled = compiled_model(merged, text, assets)
+    except ValueError as error:
+        raise LoadError(f"{source}: MuJoCo's compiler refuses its shapes: {error}") from None
     out.shapes += _geoms(model, compiled, kind)
     return out
 
@@ -255,22 +263,6 @@ def _written(element: Element, missing: dict[str, str], out: Visuals, body: str 
     return element_text(element.tag, attributes, "".join(_written(e, missing, out, body) for e in element.children))
 
 
-def _compiled(text: str, assets: dict[str, bytes], source: Path) -> Any:
-    # Only an MJCF needs it.
-    import mujoco
-
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda _: None)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            return mujoco.MjModel.from_xml_string(text, assets=assets)
-    except ValueError as error:
-        raise LoadError(f"{source}: MuJoCo's compiler refuses its shapes: {' '.join(str(error).split())}") from None
-    finally:
-        mujoco.set_mju_user_warning(before)
-
-
 def _geoms(model: _Bodies, compiled: Any, kind: str) -> Iterator[Shape]:
     meshes: dict[int, tuple[Surface, ...]] = {}
     for k in range(compiled.ngeom):
@@ -286,8 +278,7 @@ def _geoms(model: _Bodies, compiled: Any, kind: str) -> Iterator[Shape]:
         if place is None or shape not in ("mesh", *SIZES):
             continue
         body, R_BF, p_BF = place
-        x, y, z, w = (float(geom.quat[i]) for i in (1, 2, 3, 0))
-        R = R_BF @ spatial.matrix_from_quaternion(np.array([x, y, z, w]))
+        R = R_BF @ matrix_of(geom.quat)
         material = int(geom.matid[0])
         rgba = compiled.mat_rgba[material] if material >= 0 else geom.rgba
         placed = (geom.name or f"{name}.{k}", body, R, p_BF + R_BF @ geom.pos)

@@ -316,8 +316,3 @@ def _jacobian(of: Callable[..., None], m: Any, d: Any, p: Array, body: int) -> A
 def wxyz(R: Array) -> Array:
     """Return a rotation as a quaternion in MuJoCo's order."""
     return np.roll(spatial.quaternion_from_matrix(R), 1)
-
-
-def matrix_of(wxyz: Any) -> Array:
-    """Return the rotation matrix of a quaternion in MuJoCo's order."""
-    return spatial.matrix_from_quaternion(np.roll(np.asarray(wxyz, dtype=np.float64), -1))

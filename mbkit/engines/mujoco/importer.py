@@ -18,12 +18,11 @@ import numpy as np
 from mbkit._check import Array, by_key
 from mbkit._reproducible import turned
 from mbkit.engines.imported import Beside, Imported, Parts, checked
-from mbkit.engines.mujoco.constraints import matrix_of
 from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.mujoco.model import INERTIA, full_mass_matrix, heard_warnings, mapped
 from mbkit.errors import UnsupportedError
 from mbkit.load.mjcf import JOINT_NUMBERS
-from mbkit.load.mjcf_attributes import Pose
+from mbkit.load.mjcf_attributes import Pose, matrix_of
 from mbkit.load.mjcf_couplings import Acting, with_parts
 from mbkit.load.mjcf_equalities import coupled
 from mbkit.load.mjcf_reader import KINDS, MjcfBody, MjcfJoint

@@ -18,9 +18,10 @@ import numpy as np
 
 from mbkit._check import Array, by_key
 from mbkit.engines.base import BESIDE, OF_ANY_ENGINE, OF_COUPLINGS, OF_TREES, SOLVED, STACKS
-from mbkit.engines.mujoco.constraints import EQUALITIES, OF_JOINTS, OF_TENDON, Softness, matrix_of, wxyz
+from mbkit.engines.mujoco.constraints import EQUALITIES, OF_JOINTS, OF_TENDON, Softness, wxyz
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.load.mjcf import JOINT_NUMBERS
+from mbkit.load.mjcf_attributes import matrix_of
 from mbkit.load.xml_reader import unused
 from mbkit.model import Body, Bushing, GravityCompensation, Joint, Model
 from mbkit.model.elements.kinds import EFFECTS, joint_types
