@@ -17,6 +17,8 @@ from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 Array = NDArray[np.float64]
 K = TypeVar("K")
 V = TypeVar("V")
+#: Distance from 1 to the next double.
+EPS: Final = float(np.finfo(float).eps)
 _MAX_SUMMED: Final = 64
 #: Numbers of a piece of an array that is checked and copied in pieces.
 _PIECE_SIZE: Final = 2**16

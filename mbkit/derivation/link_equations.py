@@ -17,7 +17,7 @@ from typing import Any, Final
 import casadi as ca
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.derivation.constraints import ConstrainedMotion, Constraints, loop_drifts
 from mbkit.derivation.equations import NOTHING, Acting, ConstrainedEquations, Elimination, Equations
 from mbkit.derivation.gauss_elimination import GaussElimination
@@ -205,7 +205,7 @@ class LinkEquations(Equations):
                     if not np.isfinite(error):
                         return np.inf
                     worst = max(worst, float(error))
-        return worst / float(np.finfo(float).eps)
+        return worst / EPS
 
     def _force_error(self, form: Any, exact: Any) -> float:
         """Return how far two forms of inverse dynamics are apart at hard poses, in eps."""
@@ -220,7 +220,7 @@ class LinkEquations(Equations):
                 if not np.isfinite(error):
                     return np.inf
                 worst = max(worst, float(error))
-        return worst / float(np.finfo(float).eps)
+        return worst / EPS
 
     def _poses(self, rng: np.random.Generator) -> Array:
         """Return poses at which axes align, the ends of limits among them."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._attributes import forwarded
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit._reproducible import dependent, independent_rows, pivoted, singular_values, under_rows, unit_rows
 from mbkit.derivation.constraints import starts
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, projection
@@ -29,12 +29,11 @@ from mbkit.model import Model
 from mbkit.model.manifold import closest_configuration, least_change
 from mbkit.model.rolling import discs_of
 
-_EPS: Final = float(np.finfo(float).eps)
 #: Rounds of the projection's iterations.
 _ROUNDS: Final = 8
 #: Of the largest singular value of J, the smallest one at a singular pose: there v̇ from the equation of motion loses as
 #: many digits, eps/σ, as that of the pose itself is off, σ. So it is no `DEPENDENT`, where no digit is left.
-AT_POSE: Final = float(np.sqrt(_EPS))
+AT_POSE: Final = float(np.sqrt(EPS))
 #: Steps of the search for a foot.
 _MOST: Final = 200
 _TWIN: Final = "_constrained_twin"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, batch_of, real, real_array, require_finite
+from mbkit._check import EPS, Array, batch_of, real, real_array, require_finite
 from mbkit._imports import from_above
 from mbkit.engines.constrained import unwatched
 from mbkit.engines.frames_and_momenta import ALIGNED, axes_named
@@ -41,7 +41,6 @@ STEP_DERIVATIVE: Final = Path(
     also=lambda model: () if model.velocity_map is None else ("it has quasi-velocities of its own",),
     instead="linearize(q, v, tau).discretize(dt) holds the linear system's force",
 )
-_EPS: Final = float(np.finfo(float).eps)
 #: Newton's iterations for the stages of an implicit method, and the part of the numbers' size below which corrections
 #: that stop shrinking are rounding.
 _MAX_NEWTON_ITERATIONS: Final = 25
@@ -436,7 +435,7 @@ def _implicit_step(tableau: ImplicitTableau, space: DualSpace, rates: _Rates, h:
 def _settled(change: Array, last: Array, numbers: Array) -> tuple[bool, Array]:
     """Return whether Newton's corrections, one row per state, are rounding of these numbers, and their sizes."""
     far, limit = np.abs(change).max(axis=-1, initial=0.0), np.abs(numbers).max(axis=-1, initial=1.0)
-    done = (far <= 4 * _EPS * limit) | ((far >= last / 2) & (far <= _STALLED_CORRECTION * limit))
+    done = (far <= 4 * EPS * limit) | ((far >= last / 2) & (far <= _STALLED_CORRECTION * limit))
     return bool(done.all()), far
 
 

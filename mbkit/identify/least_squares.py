@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.identify.measurements import Equations
 from mbkit.model.base_parameters import eliminated
 
@@ -28,7 +28,6 @@ _MAX_REWEIGHTINGS: Final = 10
 MIN_NOISE_RATIO: Final = 1e-6
 #: Change of variances between two rounds at which they are taken as settled.
 _VARIANCE_CHANGE: Final = 1e-3
-_EPS: Final = float(np.finfo(float).eps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +80,7 @@ def fit(equations: Sequence[Equations], start: Array, units: Array, *, weighted:
             break
     null = solution.null
     # Rounding of a sum of equations moves the estimates together, unlike noise of each.
-    rounding = _EPS * max((x.count**0.5 * x.size for x in equations), default=0.0)
+    rounding = EPS * max((x.count**0.5 * x.size for x in equations), default=0.0)
     deviations = np.where(null.any(axis=0), np.inf, solution.deviations(np.maximum(residuals, rounding)))
     return Fit(solution.values, deviations, null, solution.condition, residuals)
 
@@ -94,7 +93,7 @@ def stacked(equations: Sequence[Equations], noise: Array) -> Array:
 
 def _weighing(noise: Array, equations: Sequence[Equations]) -> Array:
     """Return the noise that weighs: no less than rounding, nor so small that the other equations would not count."""
-    rounding = _EPS * (max((x.size for x in equations), default=0.0) or 1.0)
+    rounding = EPS * (max((x.size for x in equations), default=0.0) or 1.0)
     return np.maximum(noise, max(rounding, MIN_NOISE_RATIO * float(noise.max(initial=0.0))))
 
 

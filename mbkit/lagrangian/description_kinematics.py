@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 import sympy as sp
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit._reproducible import DEPENDENT, pivoted
 from mbkit.derivation.kinematics import Kinematics, compensation_energies, gravity_energy, kinetic_energy
 from mbkit.derivation.model_values import Values
@@ -323,8 +323,6 @@ def _turn(angle: sp.Expr) -> sp.Expr:
 
 # Coordinates that are moved in time, as expressions of it.
 
-_EPS: Final = 2.0**-52
-
 
 def coupled(kin: SymbolicKinematics, coupler: Coupler) -> sp.Expr:
     """Return q less what its leaders give it."""
@@ -338,7 +336,7 @@ def coupled(kin: SymbolicKinematics, coupler: Coupler) -> sp.Expr:
 def angle(x: float) -> sp.Expr:
     """Return an angle, as a multiple of π/12 where it is one to rounding."""
     twelfths = round(12 * x / pi)
-    if abs(x - twelfths * pi / 12) <= 2 * _EPS * abs(x):
+    if abs(x - twelfths * pi / 12) <= 2 * EPS * abs(x):
         return sp.Rational(twelfths, 12) * sp.pi
     return number(Fraction(repr(x)))
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit import spatial
-from mbkit._check import TWO_TURNS, Array, by_key
+from mbkit._check import EPS, TWO_TURNS, Array, by_key
 from mbkit._reproducible import turned
 from mbkit.errors import ModelError, Suggestions
 from mbkit.load import xml_reader
@@ -499,7 +499,7 @@ def _element_hint(owner: str, tag: str, known: frozenset[str]) -> str:
 
 
 # A rotation matrix from a quaternion is off by up to about 5 eps.
-_ROTATION_ERROR: Final = 8 * float(np.finfo(float).eps)
+_ROTATION_ERROR: Final = 8 * EPS
 
 
 class Snapper:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final, Literal, NamedTuple
 
+from mbkit._check import EPS
 from mbkit.errors import InputError, UnsupportedError, require_known
 from mbkit.methods.one_step import SemiImplicitEuler
 from mbkit.methods.stability import IMPLICIT_EULER, IMPLICIT_IN_VELOCITY, SYMPLECTIC_EULER, Stability, TableauStability
@@ -27,7 +28,6 @@ from mbkit.methods.tableaus import (
     rodas5p,
 )
 
-_EPS: Final = 2.0**-52
 #: With a step, when nothing else is said.
 DEFAULT_METHOD: Final = "rk4"
 #: The method of first order, as MuJoCo does it.
@@ -209,13 +209,13 @@ def _fixed(name: str, order: int, **more: Any) -> Method:
 
 
 def _adaptive(name: str, order: int | None, solver: str, **more: Any) -> Method:
-    more = {"stages": 0, "events": True, "least": _EPS, **more}
+    more = {"stages": 0, "events": True, "least": EPS, **more}
     return Method(name, "adaptive", order, about=_ABOUT[name], solver=solver, **more)
 
 
 def _scipy(name: str, scheme: str, order: int | None, **more: Any) -> Method:
     # SciPy's solvers raise a smaller rtol to this by themselves.
-    return _adaptive(name, order, "scipy:run_scipy", scheme=scheme, least=100 * _EPS, **more)
+    return _adaptive(name, order, "scipy:run_scipy", scheme=scheme, least=100 * EPS, **more)
 
 
 def _native(name: str, order: int, stability: Stability, *engines: str, **more: Any) -> Method:

@@ -13,9 +13,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 
-_EPS: Final = float(np.finfo(float).eps)
 #: Number of refinements; each squares the error.
 _REFINEMENTS: Final = 5
 
@@ -38,7 +37,7 @@ def small_motion(M: Array, D: Array, K: Array, errors: Sequence[Any] = (0.0, 0.0
     """
     if not len(M):
         return SmallMotion(None, np.empty(0), np.empty(0, dtype=complex))
-    bounds = [_EPS * np.abs(A) + e for A, e in zip((M, D, K), errors, strict=True)]
+    bounds = [EPS * np.abs(A) + e for A, e in zip((M, D, K), errors, strict=True)]
     D, K = (np.where(np.abs(A) > e, A, 0.0) for A, e in zip((D, K), bounds[1:], strict=True))
     symmetric = bool((np.abs(K - K.T) <= bounds[2] + bounds[2].T).all())
     M, K = (M + M.T) / 2, (K + K.T) / 2 if symmetric else K
@@ -62,7 +61,7 @@ def definite(A: Array, error: Array) -> int:
     size = np.where(size > 0, size, np.where(across > 0, across, 1.0))
     scale = np.outer(size, size)
     least = float(np.linalg.eigvalsh(A / scale)[0])
-    slack = 4 * len(A) * _EPS + float(np.linalg.norm(np.where(A, error, 0.0) / scale))
+    slack = 4 * len(A) * EPS + float(np.linalg.norm(np.where(A, error, 0.0) / scale))
     return int(least > slack) - int(least < -slack)
 
 
@@ -112,7 +111,7 @@ def _inverse_iteration(pencil: Sequence[Array], at: Any, x: Any, y: Any) -> tupl
     scale = 1 / np.sqrt(np.where(size > 0, size, 1.0))
     # A number of the size of rounding keeps the matrix regular, and changes its inverse along the sought vectors alone.
     inverse = np.linalg.inv(
-        (z * z * A + z * B + C) * scale[:, :, None] * scale[:, None, :] + (1 + 1j) * _EPS * np.eye(len(A))
+        (z * z * A + z * B + C) * scale[:, :, None] * scale[:, None, :] + (1 + 1j) * EPS * np.eye(len(A))
     )
     slope = 2 * z * A + B
     ahead = scale * np.einsum("kij,kj->ki", inverse, scale * np.einsum("kij,kj->ki", slope, x))

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.errors import InputError
 from mbkit.methods.one_step import StageRates, Stages
 from mbkit.model.integration_space import Space
@@ -71,7 +71,7 @@ def rounding_of_condition(A: Array, b: Array, tree: Tree) -> float:
     product of the magnitudes.
     """
     size = float(np.abs(b) @ _stage_weights(np.abs(A), tree))
-    return _nodes(tree) * (len(b) + 1) * float(np.finfo(float).eps) * size
+    return _nodes(tree) * (len(b) + 1) * EPS * size
 
 
 def _require_order(name: str, A: Array, b: Array, order: int) -> None:

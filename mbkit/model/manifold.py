@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from mbkit import spatial
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit._reproducible import DEPENDENT, under_rows
 from mbkit.errors import InputError
 from mbkit.model.description import Description
@@ -19,7 +19,6 @@ NEAR_UNIT: Final = 1e-9
 #: Part of a Gauss-Newton step below which a residual that does not fall is at its least, and steps of a search.
 _LEAST_STEP_PART: Final = 1e-6
 _MAX_SEARCH_STEPS: Final = 60
-_EPS: Final = float(np.finfo(float).eps)
 
 
 def check_quaternions(model: Description, q: Array, name: str = "q") -> None:
@@ -194,7 +193,7 @@ def closest_configuration(
     scale = np.where(sizes > DEPENDENT * sizes.max(initial=0.0), sizes, 1.0)
     size = float(np.linalg.norm(f / scale))
     for _ in range(_MAX_SEARCH_STEPS):
-        if size <= 4 * _EPS * (1.0 + float(np.abs(q).max(initial=0.0))):
+        if size <= 4 * EPS * (1.0 + float(np.abs(q).max(initial=0.0))):
             break
         whole, length = least_change(W, J, -f, held), 1.0
         while length > _LEAST_STEP_PART:

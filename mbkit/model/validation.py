@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
-from mbkit._check import Array, by_key
+from mbkit._check import EPS, Array, by_key
 from mbkit.errors import InputError, ModelError, Suggestions, did_you_mean
 from mbkit.model import manifold
 from mbkit.model.description import Description
@@ -374,7 +374,7 @@ def idle_joints(model: Description) -> tuple[list[str], bool]:
         root = np.sqrt(diagonal)
         scaled = M / root[:, None] / root
         values, vectors = np.linalg.eigh(scaled)
-        if values[0] > 4 * model.nv * np.finfo(float).eps:
+        if values[0] > 4 * model.nv * EPS:
             return [], True
         alone = False
         zero = np.abs(vectors[:, 0]) > 0.3 * np.abs(vectors[:, 0]).max()

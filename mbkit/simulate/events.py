@@ -14,7 +14,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from mbkit._check import Array, real
+from mbkit._check import EPS, Array, real
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
 from mbkit.errors import EventError, FunctionError, InputError, NumericalError, UnknownNameError
@@ -188,13 +188,12 @@ class Watch:
 
         # An interpolant may round to another sign at the ends.
         known = dict((first, last))
-        eps = float(np.finfo(float).eps)
-        xtol = 4 * eps * max(abs(first[0]), abs(last[0]))
+        xtol = 4 * EPS * max(abs(first[0]), abs(last[0]))
 
         def value(t: float) -> float:
             return known[t] if t in known else self._value(event, t, state(t))
 
-        return float(brentq(value, first[0], last[0], xtol=xtol, rtol=4 * eps))
+        return float(brentq(value, first[0], last[0], xtol=xtol, rtol=4 * EPS))
 
 
 def as_events(events: object) -> tuple[Event, ...]:

@@ -9,7 +9,7 @@ from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 
-from mbkit._check import Array, batch_of, real
+from mbkit._check import EPS, Array, batch_of, real
 from mbkit._warn import warn
 from mbkit.engines import Dynamics
 from mbkit.engines.base import DOUBLE_BITS
@@ -145,7 +145,7 @@ def _period(
         return None
     if not callable(request.torque):
         raise InputError("hold: expected a torque function, which is sampled; an array is held as it is")
-    hold, eps = real("hold", request.hold, positive=True), float(np.finfo(float).eps)
+    hold, eps = real("hold", request.hold, positive=True), EPS
     steps = hold / dt if dt else 1.0
     if not (1 - _MAX_OFF_MULTIPLE <= steps < np.inf and abs(steps - round(steps)) <= _MAX_OFF_MULTIPLE):
         raise InputError(f"hold: expected a multiple of the step, {dt:g} s, got {hold:g} s")
@@ -262,7 +262,7 @@ def times_of(
     start = _held_time(dyn) if t0 is None else real("t0", t0)
     dyn.model.require_times("simulate", start, start + duration)
     shortest = duration if method.kind == "adaptive" else min(duration, step)
-    if 4 * np.finfo(float).eps * abs(start) > shortest > 0:
+    if 4 * EPS * abs(start) > shortest > 0:
         raise InputError(f"t0: expected times that differ after {shortest:g} s, got {start:g} s; shift the time's zero")
     return start, duration, step
 

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbkit._check import Array, finite_array
+from mbkit._check import EPS, Array, finite_array
 from mbkit.errors import InputError
 
 Indices = NDArray[np.intp]
@@ -40,7 +40,7 @@ class Grid:
         if not ratio < 2**53:
             raise InputError(f"dt: {dt:g} s makes {ratio:.3g} steps of {duration:g} s; expected a larger step")
         whole = round(ratio)
-        if abs(ratio - whole) <= 4 * np.finfo(float).eps * ratio:
+        if abs(ratio - whole) <= 4 * EPS * ratio:
             return cls(start, end, dt, whole, dt)
         steps = int(np.ceil(ratio))
         return cls(start, end, dt, steps, duration - (steps - 1) * dt)
@@ -84,7 +84,7 @@ class Grid:
         index = np.minimum(np.rint((times - self.start) / self.dt), self.steps).astype(np.intp)
         index = np.where(times == self.end, self.steps, index)
         on_grid = self.times_of(index)
-        off = np.abs(on_grid - times) > 1e-6 * self.dt + 4 * np.finfo(float).eps * abs(self.start)
+        off = np.abs(on_grid - times) > 1e-6 * self.dt + 4 * EPS * abs(self.start)
         if off.any():
             raise InputError(
                 f"save: {times[np.argmax(off)]:.9g} s is not a step of dt = {self.dt:g} s; "

@@ -9,7 +9,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.oracle import OracleDynamics
@@ -33,7 +33,7 @@ GROSS: Final = 1e-2
 #: The largest error that a result holds.
 MAX_ERROR: Final = 1e300
 #: Rounding of a double energy, relative to it; beyond this part of the motion's energy it can hide an error.
-_ENERGY_ROUNDING: Final = 16.0 * float(np.finfo(float).eps)
+_ENERGY_ROUNDING: Final = 16.0 * EPS
 _MIN_HIDING_ROUNDING: Final = 1e-9
 
 

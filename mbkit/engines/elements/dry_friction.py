@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit._reproducible import unit_rows
 from mbkit._warn import warn
 from mbkit.engines.elements.added_force import LOADS, UNDER_FORCE, AddedForce
@@ -37,9 +37,8 @@ _MAX_ROUNDS_WITHOUT_PROGRESS: Final = 3
 _MAX_KEPT_PHASES: Final = 256
 _FORWARD: Final = "forward_dynamics"
 _DOUBLE_SIGNIFICAND_BITS: Final = 53
-_EPS: Final = float(np.finfo(float).eps)
 #: Part of the forces that their sums lose to rounding.
-_FORCE_ROUNDING: Final = 64 * _EPS
+_FORCE_ROUNDING: Final = 64 * EPS
 #: Addition to the diagonal of a singular A: far from its own rounding and from what is not rounding.
 _PROXIMAL_SHIFT: Final = 2.0**-32
 #: Proximal points; two are enough, unless A is nearly singular, too.

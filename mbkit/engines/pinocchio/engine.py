@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 import numpy as np
 import pinocchio as pin
 
-from mbkit._check import TWO_TURNS, Array
+from mbkit._check import EPS, TWO_TURNS, Array
 from mbkit.engines import known_defects
 from mbkit.engines.base import Dynamics, first_names
 from mbkit.engines.elements.passive import JointPassive
@@ -375,7 +375,7 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
         """Return the names of bodies so light that Pinocchio's sum of inertias, and so M, is wrong."""
         out = []
         for body in self.model.bodies:
-            if 0 < body.mass < np.finfo(float).eps:
+            if 0 < body.mass < EPS:
                 one = pin.Inertia(body.mass, np.array([1.0, 0.0, 0.0]), np.zeros((3, 3)))
                 out += [repr(body.name)] if abs((one + one).lever[0] - 1) > 1e-9 else []
         return first_names(out)

@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, finite_array, generator
+from mbkit._check import EPS, Array, finite_array, generator
 from mbkit._escape import html, terminal
 from mbkit._reproducible import DEPENDENT
 from mbkit.engines.base import Dynamics, at_time
@@ -42,13 +42,13 @@ _START_HALVINGS: Final = 12
 # rad or m: a neighbourhood, in which stiffness that vanishes at a threshold does not.
 _NEIGHBOUR_DISTANCE: Final = 0.1
 #: Step of differences of fourth order, whose error is far below half of the digits.
-_DIFFERENCE_STEP: Final = float(np.finfo(float).eps) ** 0.2
+_DIFFERENCE_STEP: Final = EPS**0.2
 #: s: when a system that depends on the time is looked at again, and what may differ then.
 _LATER: Final = (0.7310585786300049, 2.0178)
 _EQUAL_STATES_RATIO: Final = 1e-9
 #: Rounding of an exact derivative, and of differences, relative to their terms.
-_EXACT_ERROR_RATIO: Final = 8 * float(np.finfo(float).eps)
-_DIFFERENCE_ERROR_RATIO: Final = 8 * float(np.finfo(float).eps) ** 0.8
+_EXACT_ERROR_RATIO: Final = 8 * EPS
+_DIFFERENCE_ERROR_RATIO: Final = 8 * EPS**0.8
 
 
 def _driven(model: Model) -> Iterator[str]:

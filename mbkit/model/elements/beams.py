@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.polynomial import Legendre, Polynomial
 
-from mbkit._check import Array, count, shown
+from mbkit._check import EPS, Array, count, shown
 from mbkit.errors import InputError
 from mbkit.model.joint_types import KINDS, JointType, Placement, Rows, Scalars, Twist, cross3, register_joint_type
 
@@ -25,9 +25,8 @@ from mbkit.model.joint_types import KINDS, JointType, Placement, Rows, Scalars, 
 _MAX_MODES: Final = 10
 _MAX_POLYNOMIAL_DEGREE: Final = 20
 _RULE: Final = np.polynomial.legendre.leggauss(96)
-_EPS: Final = float(np.finfo(float).eps)
 #: Difference of two exact rules by the fine one's rounding; one point more gains a factor of 20.
-_RULE_ROUNDING: Final = 500 * _EPS
+_RULE_ROUNDING: Final = 500 * EPS
 _IDENTITY: Final[Rows] = np.eye(3).tolist()
 #: The straight line from the root.
 _ROOTED: Final = Polynomial((0.0, 1.0))
@@ -125,7 +124,7 @@ def modes_within(shapes: Sequence[Polynomial]) -> Modes:
     M, K = (weights * (x := given(xi, k)) @ x.T for k in (0, 2))
     size = np.sqrt(np.diag(M))
     values, vectors = np.linalg.eigh(M / size / size[:, None])
-    if not values[0] > len(shapes) * 100 * _EPS * values[-1]:
+    if not values[0] > len(shapes) * 100 * EPS * values[-1]:
         raise InputError("shapes: one of them is a sum of the others; leave it out")
     half = vectors / np.sqrt(values) / size[:, None]
     squares, turn = np.linalg.eigh(half.T @ K @ half)

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import DOUBLE_BITS, at_time
 from mbkit.engines.constrained import ROUNDING, off_by
@@ -24,7 +24,6 @@ from mbkit.model.integration_space import Space
 from mbkit.model.manifold import magnitude, unit_quaternions
 from mbkit.simulate.diagnostics.stiffness import linearized
 
-_EPS: Final = sys.float_info.epsilon
 #: Most times at which the mass matrix and the energy are evaluated.
 CHECKED_TIMES: Final = 7
 #: Most trajectories of a batch for which they are.
@@ -57,7 +56,7 @@ _TRANSIENT_SHARE: Final = 0.01
 #: a random configuration has a unit diagonal.
 _MAX_EIGENVALUE_RATIO: Final = 1e-7
 #: Largest velocity of a state at rest, m/s or rad/s: rounding of its projection.
-_MAX_REST_VELOCITY: Final = 1e3 * _EPS
+_MAX_REST_VELOCITY: Final = 1e3 * EPS
 #: Smallest motion of a run in units of `atol`, of which a hundredth is known.
 _MIN_MOTION: Final = 100.0
 #: Largest error of a position, m or rad.
@@ -213,7 +212,7 @@ def energy_drift(samples: list[list[_Sample]], fast: list[Array], damped: bool, 
         wrong = max(change) if damped else max(change, key=abs)
         sizes = np.abs(kinetic).max(), np.ptp(potential), *(one.kinetic(velocity) for one in member)
         size = float(max(*sizes, sys.float_info.min))
-        if abs(wrong) > 1e4 * _EPS * np.abs(potential).max() and abs(wrong) / size > share:
+        if abs(wrong) > 1e4 * EPS * np.abs(potential).max() and abs(wrong) / size > share:
             worst, share = wrong, abs(wrong) / size
     if worst:
         yield (
@@ -245,10 +244,10 @@ def condition(matrices: list[Array]) -> Iterator[str]:
         if not scale.min() > 0:
             return
         least = min(least, float(np.linalg.eigvalsh(M / scale / scale[:, None])[0]))
-    if least < _EPS * n / _MAX_ROUNDING:
+    if least < EPS * n / _MAX_ROUNDING:
         yield (
             f"the mass matrix is singular to {max(least, 0.0):.1g} of its size, so that accelerations hold "
-            f"about {max(0, int(-np.log10(_EPS / max(least, _EPS)))):d} digits; leave out what has no mass, or compute "
+            f"about {max(0, int(-np.log10(EPS / max(least, EPS)))):d} digits; leave out what has no mass, or compute "
             f"with 34 digits: mbkit.dynamics(model, 'oracle') and method={SERIES_METHOD!r}"
         )
 
@@ -330,9 +329,9 @@ def coordinate_magnitude(q: Array, tolerances: Tolerances | None) -> Iterator[st
     """Find coordinates so large that their last digit, or a relative tolerance, is a distance that matters."""
     # Past NaN.
     largest = float(np.fmax.reduce(np.abs(q), axis=None))
-    if _EPS * largest > _MAX_POSITION_ERROR:
+    if EPS * largest > _MAX_POSITION_ERROR:
         yield (
-            f"a coordinate of {largest:.2g} is known to {_EPS * largest:.1g} in double precision; "
+            f"a coordinate of {largest:.2g} is known to {EPS * largest:.1g} in double precision; "
             "count it from a nearer origin"
         )
     elif tolerances is not None and tolerances.rtol * largest > max(1e3 * tolerances.atol, _MAX_POSITION_ERROR):

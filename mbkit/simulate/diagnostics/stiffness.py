@@ -18,7 +18,7 @@ from typing import Any, Final, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, batch_of, finite_array, real
+from mbkit._check import EPS, Array, batch_of, finite_array, real
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.base import at_time, no_dynamics
 from mbkit.engines.registry import DERIVED
@@ -30,9 +30,8 @@ from mbkit.model.manifold import tangent_maps, unit_quaternions
 from mbkit.simulate.torque import Force, TorqueCallback, TorqueFunction
 
 _TWIN: Final = "_derived_twin"
-_EPS: Final = float(np.finfo(float).eps)
 #: Step of central differences in q, at which truncation and rounding are alike for a function of its own size.
-_Q_DIFFERENCE: Final = _EPS ** (1 / 3)
+_Q_DIFFERENCE: Final = EPS ** (1 / 3)
 #: Step of central differences in v, wide for the digits: accelerations are of second order in v, and so exact.
 _V_DIFFERENCE: Final = 1e-4
 #: Smallest Re λ over |λ| of a motion that grows rather than oscillates.
@@ -131,7 +130,7 @@ def _differences(
 ) -> tuple[Array, Array]:
     """Return ∂τ/∂q along the manifold and ∂τ/∂v of a user's function, good to half of the digits."""
     by_q, by_v = np.empty((model.nv, model.nv)), np.empty((model.nv, model.nv))
-    root = float(np.sqrt(_EPS))
+    root = float(np.sqrt(EPS))
     for k, e in enumerate(np.eye(model.nv)):
         h = root * max(1.0, abs(float(v[k])))
         by_q[:, k] = (force(t, model.integrate(q, root * e), v) - tau) / root

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.codegen.compiled import aligned
 from mbkit.codegen.step_loop import CompiledStepLoop, compiled_step_loop, width
 from mbkit.derivation.steps.adaptive import STATE, embedded_parts
@@ -87,7 +87,7 @@ class CompiledAttempts:
         self._stages = own.stages + self._stiff
         self._rate, self._grows = ("k", 5) if self._stiff else ("k_0", 8)
         self._code = _code(problem.dyn, own)
-        self._outer = _Arena(self._code, tolerances, problem.duration * float(np.finfo(float).eps))
+        self._outer = _Arena(self._code, tolerances, problem.duration * EPS)
         self._inner: _Arena | None = None
         self._tolerances, self._of_place = tolerances, [tolerances] * width()
         self.width, self.rounds = width(), ROUNDS

@@ -14,14 +14,13 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.methods.tableaus import ImplicitTableau
 from mbkit.model.integration_space import Space
 from mbkit.simulate.singular_poses import LOOSEST
 from mbkit.simulate.solvers.vector_field import DIVERGED, DivergenceError, Field
 from mbkit.simulate.torque import Force
 
-_EPS: Final = float(np.finfo(float).eps)
 _MOST: Final = 60
 _MOST_NEWTON: Final = 25
 # Where a correction is not this much smaller than the last one, plain iteration gives
@@ -166,7 +165,7 @@ class CollocationStep:
         with np.errstate(divide="ignore", invalid="ignore"):
             factor = size / last
             rest = size * factor / (1 - factor)
-        done = (size <= _EPS * speed) | (measurable & (factor < 1) & (rest <= _EPS / 4 * speed))
+        done = (size <= EPS * speed) | (measurable & (factor < 1) & (rest <= EPS / 4 * speed))
         done |= (
             measurable
             & (factor > 0.5)
@@ -200,7 +199,7 @@ class CollocationStep:
     def _slopes(self, start: _Start, c: float, u: Array, w: Array) -> Array:
         """Return J = ∂(u̇, ẇ)/∂(u, w) by differences: half of the digits are enough for the iteration."""
         nv = self._nv
-        size = sqrt(_EPS) * max(1.0, float(np.abs(w).max(initial=0.0)))
+        size = sqrt(EPS) * max(1.0, float(np.abs(w).max(initial=0.0)))
         J = np.empty((*w.shape[:-1], 2 * nv, 2 * nv))
         there, moved = np.empty(J.shape[:-1]), np.empty(J.shape[:-1])
         y = np.concatenate([u, w], axis=-1)

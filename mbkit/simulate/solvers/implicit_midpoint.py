@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation.mass_matrix_solve import factors_written_out
 from mbkit.derivation.steps.constrained_midpoint import ConstrainedMidpoint
@@ -35,7 +35,6 @@ _OTHERS: Final = f"{IMPLICIT_METHODS} are the implicit methods for it"
 SYMPLECTIC: Final = Path("symplectic runs", "implicit_midpoint: no form is kept of", ALL - {"speed"}, instead=_OTHERS)
 #: Most iterations of a step under a torque function, with which they converge linearly.
 _MAX_ITERATIONS_WITH_FUNCTION: Final = 60
-_EPS: Final = float(np.finfo(float).eps)
 _UNSOLVED: Final = "Newton's iteration does not solve the step's equations"
 #: Count of momenta that are turned into velocities at a time.
 _MAX_MOMENTA: Final = 2**16
@@ -184,7 +183,7 @@ class MidpointStepper(Stepper):
             w1, solved = self._newton(self._members[todo], t + h / 2, q[todo], pi[todo], w[todo], tau[todo], h)
             change = np.abs(w1 - w[todo]).max(axis=1, initial=0.0)
             if not isinstance(force, np.ndarray):
-                solved &= (change <= 4 * _EPS * np.abs(w1).max(axis=1, initial=0.0)) | (change >= last[todo] / 2)
+                solved &= (change <= 4 * EPS * np.abs(w1).max(axis=1, initial=0.0)) | (change >= last[todo] / 2)
             w[todo], good[todo], last[todo] = w1, solved, change
         return w, tau, good
 

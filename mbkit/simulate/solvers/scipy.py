@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.errors import MbkitError
 from mbkit.methods.registry import method_of
 from mbkit.simulate.problem import IntegrationProblem
@@ -28,7 +28,6 @@ from mbkit.simulate.solvers.trajectory_record import (
 from mbkit.simulate.solvers.vector_field import Rates, is_bounded
 from mbkit.simulate.torque import Force
 
-_EPS: Final = float(np.finfo(float).eps)
 #: Forward dynamics of each step that DOP853 tries.
 _STAGES: Final = 12
 
@@ -131,7 +130,7 @@ class _Solve:
         while self._method.scheme == "LSODA" and solver.status != "failed" and not is_bounded(solver.y):
             # It steps into non-finite states; the others shorten the step by themselves.
             first = (solver.t - t) / 4
-            again = self._solver(t, y, force, stop, first) if first > duration * _EPS else None
+            again = self._solver(t, y, force, stop, first) if first > duration * EPS else None
             if again is None:
                 break
             record.rejected += 1
@@ -202,5 +201,5 @@ def _stepped(solver: Any) -> bool:
 def _below_rounding(solver: Any, duration: float) -> bool:
     # 1/eps steps would never end, though near t = 0 they are above rounding. LSODA does not tell the next step.
     if not hasattr(solver, "h_abs"):
-        return bool(solver.status == "running" and solver.step_size < duration * _EPS)
-    return bool(solver.h_abs < duration * _EPS)
+        return bool(solver.status == "running" and solver.step_size < duration * EPS)
+    return bool(solver.h_abs < duration * EPS)

@@ -12,7 +12,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from mbkit._attributes import forwarded
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.methods.one_step import (
     FIRST_ROOT,
     MAX_GROWTH,
@@ -97,7 +97,7 @@ class RungeKuttaAttempts:
     def __init__(self, problem: IntegrationProblem, space: Space, tolerances: Tolerances) -> None:
         self._space, self._tolerances, self._torque, self._batch = space, tolerances, problem.torque, problem.batch
         self._field, self._tableau, self._wanted = Field(problem.dyn, space), dormand_prince_853(), problem.tolerances
-        self._least = problem.duration * float(np.finfo(float).eps)
+        self._least = problem.duration * EPS
         self._stages = ArrayStages(self._tableau.stages, (space.nv,))
         self._force: Force = np.zeros(space.nv)
         self._h = self._t = self._stop = 0.0

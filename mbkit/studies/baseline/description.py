@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit import spatial
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.errors import MbkitError, MbkitWarning
 from mbkit.load import load
 from mbkit.load.loader import find
@@ -142,7 +142,6 @@ def moving_mass(description: Mapping[str, Mapping[str, Part]]) -> tuple[float, A
 
 # Differences of two descriptions, parameter by parameter, in words.
 
-_EPS: Final = float(np.finfo(float).eps)
 #: Roundings in a number: another release of a parser may add the same numbers in another order.
 _MAX_ROUNDINGS: Final = 64
 _XYZ: Final = ENTRIES[:3]
@@ -273,7 +272,7 @@ def _only_rounding(field: str, old: Array, new: Array) -> bool:
     # Zero is no size of a place, a direction or a limit: an origin moved by 1e-17 m has not moved.
     absolute = rule and (rule.direction or rule.place or rule.shape == OF_Q)
     size = max(float(np.linalg.norm(old)), 1.0 if absolute else 0.0)
-    return float(np.linalg.norm(new - old)) <= _MAX_ROUNDINGS * _EPS * size
+    return float(np.linalg.norm(new - old)) <= _MAX_ROUNDINGS * EPS * size
 
 
 # A `Model` has one body for links that are fixed to each other. Their own numbers are recorded beside it, so that a

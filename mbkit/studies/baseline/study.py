@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit import spatial
-from mbkit._check import Array, count
+from mbkit._check import EPS, Array, count
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.registry import ENGINES, REFERENCE, compared, find_engine
@@ -48,7 +48,7 @@ from mbkit.studies.compare.terms import TERMS, States, states
 from mbkit.studies.results import Refusal
 from mbkit.studies.study_runs import quiet_simulate, require_motion
 
-FINE: Final = 8.0 * float(np.finfo(float).eps)
+FINE: Final = 8.0 * EPS
 ROUNDING: Final = 1e-9
 OWN: Final = 1e-12
 _ERROR_MARGIN: Final = 16.0

@@ -17,14 +17,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.engines import Dynamics
 from mbkit.engines.registry import DERIVED, MUJOCO, PINOCCHIO
 from mbkit.methods.registry import DEFAULT_METHOD, EULER_METHOD, METHODS
 from mbkit.model import Model
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.simulate import Trajectory
-from mbkit.studies.compare.errors import EPS, ROUNDINGS, interleaved
+from mbkit.studies.compare.errors import ROUNDINGS, interleaved
 from mbkit.studies.compare.findings import STEP, stiff_joints
 from mbkit.studies.compare.rows import Omission, RolloutRow
 from mbkit.studies.study_runs import quiet_simulate, start_state, state_within_limits

@@ -23,7 +23,6 @@ import numpy as np
 
 from mbkit._check import Array
 
-EPS: Final = float(np.finfo(float).eps)
 #: Each of the largest terms of a sum went through about this many roundings on the way.
 ROUNDINGS: Final = 4.0
 #: Singular values of redundant rows over the largest one.

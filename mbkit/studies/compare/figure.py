@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
+from mbkit._check import EPS
 from mbkit._escape import one_line
 from mbkit.simulate.plotting.style import (
     CROSS,
@@ -103,9 +104,8 @@ def shown_error(error: float, least: float) -> float:
 
 # Errors of each term against run times: the price of a digit on each engine.
 
-_EPS: Final = 2.0**-52
 #: Smaller errors are drawn here, where double precision tells nothing.
-_MIN_DRAWN_ERROR: Final = _EPS / 64
+_MIN_DRAWN_ERROR: Final = EPS / 64
 _PANELS_PER_ROW: Final = 5
 
 
@@ -127,7 +127,7 @@ def term_costs(rows: Sequence[Row], engines: Sequence[str], tolerance: float) ->
         level: dict[str, Any] = {"color": PAGE.muted, "linewidth": 0.9}
         dashed = {**level, "linestyle": (0, (4, 3))}
         for ax, term in zip(panels, terms, strict=True):
-            ax.axhline(_EPS, **level)
+            ax.axhline(EPS, **level)
             ax.axhline(tolerance, **dashed)
             for row in timed:
                 if row.term == term:
@@ -142,7 +142,7 @@ def term_costs(rows: Sequence[Row], engines: Sequence[str], tolerance: float) ->
         panels[0].set_yscale("log")
         times, errors = [r.ns for r in timed], [shown_error(r.relative, _MIN_DRAWN_ERROR) for r in timed]
         panels[0].set_xlim(min(times) / 1.6, max(times) * 1.6)
-        panels[0].set_ylim(min(*errors, _EPS) / 3, max(*errors, tolerance) * 3)
+        panels[0].set_ylim(min(*errors, EPS) / 3, max(*errors, tolerance) * 3)
         for k, ax in enumerate(panels):
             ax.grid(which="major")
             log_ticks(ax, 5)

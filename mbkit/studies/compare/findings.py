@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from mbkit._check import Array, by_key
+from mbkit._check import EPS, Array, by_key
 from mbkit.model import Model
 from mbkit.model.description import LEFT_OUT, SERVOS
 from mbkit.model.elements.kinds import EFFECTS
@@ -92,7 +92,7 @@ def _mobility(M: Array, J: Array | None) -> Array:
     free = np.eye(len(M))
     if J is not None and len(J):
         _, sizes, rows = np.linalg.svd(J)
-        free = rows[int((sizes > len(M) * np.finfo(float).eps * sizes[0]).sum()) :].T
+        free = rows[int((sizes > len(M) * EPS * sizes[0]).sum()) :].T
     try:
         return free @ np.linalg.solve(free.T @ M @ free, free.T)
     except np.linalg.LinAlgError:

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import Array, count, real
+from mbkit._check import EPS, Array, count, real
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.oracle import OracleDynamics
@@ -27,7 +27,6 @@ from mbkit.studies._targets import engine_names, with_values
 from mbkit.studies.compare.beyond_terms import omissions, rollouts
 from mbkit.studies.compare.body_terms import BODY_TERMS, MECHANISM_TERMS, BodyScales
 from mbkit.studies.compare.errors import (
-    EPS,
     ROUNDINGS,
     Errors,
     Scales,

@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, real
+from mbkit._check import EPS, Array, real
 from mbkit._escape import one_line
 from mbkit.codegen.extended_precision import Extended, arithmetic
 from mbkit.codegen.interpreter import Machine
@@ -319,7 +319,6 @@ _MIN_SERIES_SECONDS: Final = 5.0
 _MAX_COMPARED_STATES: Final = 64
 # The relative resolution of a pair of doubles: 106 bits of a number that can be somewhat larger than the motion.
 _PAIR_RESOLUTION: Final = 2.0**-105
-_EPS: Final = float(np.finfo(np.float64).eps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -547,7 +546,7 @@ def _cut(motion: Motion, known: RunPair, agree: float) -> Reference:
         v=v[:n],
         q_low=q_low[:n],
         v_low=v_low[:n],
-        floor=_FLOOR_PER_GAP * apart[0, :n] + 0.5 * _EPS * size,
+        floor=_FLOOR_PER_GAP * apart[0, :n] + 0.5 * EPS * size,
         digits=float(-np.log10(_FLOOR_PER_GAP * worst)),
         scale=scale,
         horizon=end,

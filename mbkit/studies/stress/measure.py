@@ -13,7 +13,7 @@ from typing import Any, Final
 import mpmath as mp
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import MbkitError, NumericalError
@@ -33,7 +33,6 @@ from mbkit.studies.stress.case import Case, problem_of, step_of, times_of
 from mbkit.studies.study_runs import Deadline, TooLongError, heard_warnings, quiet_simulate
 from mbkit.studies.worker import report_stage
 
-_EPS: Final = float(np.finfo(float).eps)
 #: The largest floor of a truth over the size of the motion: a worse one cannot show even gross errors.
 _MAX_RELATIVE_FLOOR: Final = 1e-3
 
@@ -71,7 +70,7 @@ def _closed_form(problem: Problem, times: Array) -> tuple[Truth | None, str]:
 
 def _rounding(q: Array) -> float:
     """Return the error of rounding a motion to double."""
-    return 0.5 * _EPS * float(np.abs(q).max())
+    return 0.5 * EPS * float(np.abs(q).max())
 
 
 # Reference terms. Errors are those of `mbkit.studies.compare.errors`, but for forward dynamics: there its error is

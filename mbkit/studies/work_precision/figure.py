@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from mbkit._check import by_key
+from mbkit._check import EPS, by_key
 from mbkit._escape import one_line
 from mbkit.methods.registry import METHODS
 from mbkit.simulate.plotting.style import (
@@ -46,7 +46,6 @@ _LETTER_WIDTH_INCHES: Final = 0.077
 MAX_USEFUL_ERROR: Final = 0.1
 _MAX_DRAWN_ERROR: Final = 1.0
 _MIN_DRAWN_ERROR: Final = 1e-17
-_EPS: Final = 2.0**-52
 _DASHED: Final = (0, (4, 3))
 
 
@@ -85,7 +84,7 @@ def figure(
         axes = fig.subplots(1, len(ratios), width_ratios=ratios, squeeze=False, gridspec_kw=gridspec)[0]
         _errors(axes[0], curves, duration, floor, palette, error)
         if conserved:
-            _overview(axes[1], curves, lambda p: p.energy, _EPS, palette)
+            _overview(axes[1], curves, lambda p: p.energy, EPS, palette)
             axes[1].set_title("energy over the same runs", loc="left")
             axes[1].set_ylabel("energy drift, relative")
             axes[1].set_xlabel(axes[0].get_xlabel())

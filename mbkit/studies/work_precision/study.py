@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, count, finite_array, real
+from mbkit._check import EPS, Array, count, finite_array, real
 from mbkit.engines.registry import STANDARD, find_engine
 from mbkit.errors import InputError, NumericalError
 from mbkit.methods.registry import METHODS
@@ -32,7 +32,6 @@ Exact = Callable[[float], tuple[ArrayLike, ArrayLike]]
 
 #: A reference that starts farther than this from q0 and v0, rad or m, belongs to another motion.
 _MAX_START_GAP: Final = 1e-9
-_EPS: Final = float(np.finfo(float).eps)
 #: The usual seconds of a study: base, for each velocity, and at the most.
 _BASE_SECONDS: Final = 60.0
 _SECONDS_PER_VELOCITY: Final = 10.0
@@ -245,8 +244,8 @@ def _known_reference(reference: object, model: Model, duration: float) -> Refere
         q = finite_array("reference's q", state[0], (model.nq,))
         states.append((q, finite_array("reference's v", state[1], (model.nv,))))
     q, v = (np.stack(x) for x in zip(*states, strict=True))
-    floor, how = np.full(len(q), 8 * _EPS * float(np.abs(q).max())), "an exact function, to rounding"
-    return Reference(times, q, v, 0 * q, 0 * v, floor, -np.log10(8 * _EPS), (1.0, 1.0), duration, how)
+    floor, how = np.full(len(q), 8 * EPS * float(np.abs(q).max())), "an exact function, to rounding"
+    return Reference(times, q, v, 0 * q, 0 * v, floor, -np.log10(8 * EPS), (1.0, 1.0), duration, how)
 
 
 def _start(

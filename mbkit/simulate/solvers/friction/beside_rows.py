@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse.csgraph import connected_components
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit._reproducible import pivoted
 from mbkit.engines.elements.dry_friction import Mask
 from mbkit.errors import NumericalError
@@ -24,7 +24,7 @@ from mbkit.model.changes.dry_friction import POSE_ROUNDING
 _LEFT: Final = 1e-3
 #: Acceleration, relative to speeds of 1 or more: a speed that fades as c s², s before its end, is zero by rounding from
 #: where its rate is 2 √(c eps).
-_FADED: Final = 8 * float(np.sqrt(np.finfo(float).eps))
+_FADED: Final = 8 * float(np.sqrt(EPS))
 
 
 def slow(v: Array) -> Array:

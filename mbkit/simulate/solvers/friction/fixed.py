@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.optimize.elementwise import find_root
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.engines import Dynamics
 from mbkit.engines.elements.dry_friction import Mask
 from mbkit.errors import FunctionError, NumericalError
@@ -40,7 +40,6 @@ _BLOCK, _GROWTH = 32, 4
 _SET_UP: Final = 2**10
 #: States of a block, at most.
 _MOST_STATES: Final = 2**16
-_EPS: Final = float(np.finfo(float).eps)
 #: Fraction of a step before which the end of a phase is not searched.
 _FROM: Final = 1e-6
 #: Of a time, what is left of a step whose phase ends with it.
@@ -468,7 +467,7 @@ class _PartOfStep:
         With them, which end with a speed that is zero by rounding behind `length`, too.
         """
         first = _FROM * length
-        noise = _EPS * (1 + np.abs(self._run.v[self._rows[i]]).max(axis=1))
+        noise = EPS * (1 + np.abs(self._run.v[self._rows[i]]).max(axis=1))
         soon, now = self.ahead(i, first)[2], np.full(len(i), np.inf)
         early = np.flatnonzero(soon <= -noise)
         if len(early):
@@ -494,7 +493,7 @@ class _PartOfStep:
 
         if len(open_):
             ends = np.zeros(len(open_)), np.ones(len(open_))
-            tolerances = {"xatol": 4 * _EPS, "xrtol": 4 * _EPS, "fatol": 1.0}
+            tolerances = {"xatol": 4 * EPS, "xrtol": 4 * EPS, "fatol": 1.0}
             found = find_root(least, ends, args=(open_,), tolerances=tolerances).x
             out[open_] = np.where(np.isfinite(found), low[open_] + found * (high - low)[open_], 0.0)
         return out, faded

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError, NumericalError
 from mbkit.simulate.events import Followed, Hit
@@ -21,7 +21,6 @@ from mbkit.simulate.solvers.friction.fixed import MAX_EMPTY_PHASES, UNDECIDED, S
 from mbkit.simulate.solvers.friction.phases import Friction, Phase
 from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result, diverged
 
-_EPS: Final = float(np.finfo(float).eps)
 _END: Final = "end of a phase"
 
 
@@ -113,7 +112,7 @@ def _adaptive(run: _Member) -> None:
                 return 1.0
             row = run.force(max(k, int(np.searchsorted(stops, s, side="left"))))
             out = float(run.friction.margins(own, s, q, v, row).min())
-            return max(out, _EPS) if s == begun else out
+            return max(out, EPS) if s == begun else out
 
         save = None if rows is None else np.append(rows[(rows > t) & (rows < problem.end)], problem.end)
         events = (*problem.events, Followed(end, _END, parts=2 if timed and own.still.any() else 1, noise=noise))

@@ -18,7 +18,6 @@ Make = TypeVar("Make", bound=Callable[..., Problem])
 #: Name with unit -> number, for the report.
 Facts = dict[str, float]
 
-EPS: Final = float(np.finfo(float).eps)
 #: The axis of a hinge about which a body that hangs down swings.
 SWING: Final = (0.0, -1.0, 0.0)
 #: All cases, as the modules of this package write them down.

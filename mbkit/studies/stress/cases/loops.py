@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit import catalog
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.derivation.constraints import choose_rows
 from mbkit.engines import dynamics
 from mbkit.engines.consistent.random_states import states_of
@@ -19,7 +19,7 @@ from mbkit.engines.registry import PINOCCHIO
 from mbkit.model import Model, ModelBuilder
 from mbkit.model.parts import Prescribed
 from mbkit.studies.measurement import Problem
-from mbkit.studies.stress.cases._common import EPS, Series, motion, powers, rows
+from mbkit.studies.stress.cases._common import Series, motion, powers, rows
 
 #: Crank, coupler and rocker of the four-bar that is cut down to a change point, m.
 _CRANK, _COUPLER, _ROCKER = 0.3, 0.9, 0.7

@@ -12,13 +12,13 @@ import mpmath as mp
 import numpy as np
 
 from mbkit import catalog, lagrangian
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.load import load
 from mbkit.model import Body, Model, ModelBuilder
 from mbkit.studies.measurement import Problem
 from mbkit.studies.motions import exact as exact_motions
 from mbkit.studies.motions.exact import Exact
-from mbkit.studies.stress.cases._common import EPS, SWING, Facts, Series, motion, powers, rows, terms_at
+from mbkit.studies.stress.cases._common import SWING, Facts, Series, motion, powers, rows, terms_at
 
 # Heavy beside light: masses that differ along a chain, and in a robot's hand
 

@@ -7,10 +7,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.model import Model, ModelBuilder
 from mbkit.studies.measurement import Problem
-from mbkit.studies.stress.cases._common import EPS, Series, motion, powers
+from mbkit.studies.stress.cases._common import Series, motion, powers
 
 _rubbed = partial(Series, "friction")
 #: The pull of gravity on a block of 1 kg along its slope, N.

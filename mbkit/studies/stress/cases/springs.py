@@ -10,11 +10,11 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit import catalog
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.model import Model, ModelBuilder
 from mbkit.studies.measurement import Problem
 from mbkit.studies.motions import exact as exact_motions
-from mbkit.studies.stress.cases._common import EPS, SWING, Facts, Series, motion, powers, rows
+from mbkit.studies.stress.cases._common import SWING, Facts, Series, motion, powers, rows
 
 _RANGE: Final = (powers(0, 12, 2), (1.0, 1e4, 1e8, 1e12))
 _joint = Series("stiffness", "stiffness", "N m/rad", *_RANGE)
