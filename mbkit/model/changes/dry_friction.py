@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mbkit._check import Array
+from mbkit._check import EPS, Array
 from mbkit.model.elements.forces import JointForce
 from mbkit.model.elements.formula import written
 from mbkit.model.model import Model, unchecked
@@ -33,7 +33,7 @@ ROUNDING: Final = 1e-13
 #: Velocities that follow from others by rows, relative to these, that are rounding of a pose.
 POSE_ROUNDING: Final = 1e-9
 #: Speed, m/s or rad/s, of what has stopped: below every rounding, and above what a drive that has ended leaves.
-STOPPED: Final = float(np.finfo(float).eps) ** 2
+STOPPED: Final = EPS**2
 
 
 class FrictionNumbers(NamedTuple):

@@ -43,7 +43,7 @@ _MOST_STATES: Final = 2**16
 #: Fraction of a step before which the end of a phase is not searched.
 _FROM: Final = 1e-6
 #: Of a time, what is left of a step whose phase ends with it.
-_TIMES: Final = 4 * _EPS
+_TIMES: Final = 4 * EPS
 
 
 def run_fixed_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics], Solver]) -> SolverResult:
