@@ -253,19 +253,6 @@ def test_held_torques_jump_where_they_should(kind: str) -> None:
     assert np.abs(run.q[:, 0] - [*x, x[2] - 0.7 * 0.65]).max() < 12 * EPS
 
 
-def test_parameters_differ_between_lanes() -> None:
-    model = catalog.pendulum(length=mb.Parameter("l", 1.0))
-    grid = np.array([0.0, 0.77, 2.0])
-    lengths = np.array([0.5, 1.0, 1.5, 2.0, 2.5])
-    for compile_ in (True, False):
-        dyn = dynamics(model, "lagrangian", compile=compile_)
-        many = simulate(dyn.at(l=lengths), [1.0], [0.0], 2.0, "rk853", save=grid, rtol=1e-12)
-        for i, length in enumerate(lengths):
-            alone = dynamics(catalog.pendulum(length=length), "pinocchio")
-            one = simulate(alone, [1.0], [0.0], 2.0, "dop853", rtol=1e-13, save=grid)
-            assert np.abs(many.q[i] - one.q).max() < 1e-10
-
-
 # Events
 
 
@@ -361,13 +348,6 @@ def test_interruptions_and_progress_get_through() -> None:
         told: list[float] = []
         simulate(dyn, q, v, 1.0, "rk853", progress=told.append)
         assert told[-1] == 1.0
-
-
-def test_a_model_without_joints_stands_still() -> None:
-    b = mounted("stone", "stone", "glue", "fixed", mass=1.0)
-    for dyn in (dynamics(b.build(), "pinocchio"), dynamics(b.build(), "lagrangian", compile=True)):
-        run = simulate(dyn, [], [], 1.0, "rk853", save=[0.0, 1.0])
-        assert run.q.shape == (2, 0)
 
 
 @pytest.mark.parametrize("engine", ["pinocchio", "lagrangian"])

@@ -1,5 +1,4 @@
 # Torques have the signature they are called with.
-# ruff: noqa: ARG005
 """Whole steps as one function, and rollouts compiled from them: the stepwise runs once more, only faster."""
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ import casadi as ca
 import numpy as np
 import pytest
 
-import mbkit as mb
 from mbkit import catalog
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation import Equations
@@ -398,17 +396,3 @@ def test_an_error_in_the_callers_function_stops_the_threads(
         dyn = dynamics(planar.model, "lagrangian", compile=True, threads=threads)
         with pytest.raises(StopError):
             simulate(dyn, q, v, 1e3, save=[0.0], progress=stop)
-
-
-def test_parameters_are_the_trajectorys_own() -> None:
-    model = catalog.pendulum(mass=mb.Parameter("m", 2.0), length=mb.Parameter("l", 1.0))
-    dyn = dynamics(model, "lagrangian", compile=True)
-    lengths = np.array([0.5, 1.0, 2.0])
-    for options in ({}, {"torque": lambda t, q, v: -0.1 * v}, {"method": "dop853", "save": np.linspace(0, 0.3, 4)}):
-        run = simulate(dyn.at(l=lengths), [1.0], [0.0], 0.3, **options)
-        assert run.q.shape[:1] == (3,)
-        for i, length in enumerate(lengths):
-            plain = dynamics(catalog.pendulum(mass=2.0, length=length), "lagrangian", compile=False)
-            one = simulate(plain, [1.0], [0.0], 0.3, **options)
-            assert run.q[i] == pytest.approx(one.q, abs=1e-12)
-            assert run.energy()[i] == pytest.approx(one.energy(), abs=1e-11)

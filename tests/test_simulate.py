@@ -1,5 +1,5 @@
 # Torques and stub engines have the signature they are called with.
-# ruff: noqa: ARG002, ARG005
+# ruff: noqa: ARG005
 """Integrators: their order, MuJoCo's own steps, and runs that go wrong."""
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import (
     InputError,
     MbkitWarning,
-    NumericalError,
     OutputError,
     UnknownNameError,
     UnsupportedError,
@@ -390,38 +389,6 @@ def test_save_keeps_the_same_states() -> None:
     assert np.array_equal(named.v, every.v[[3, 20, 21]])
 
 
-# Batches
-
-
-@pytest.mark.thorough("rk4-pinocchio", "rk4-lagrangian", "rk4-mujoco")
-@pytest.mark.parametrize("engine", ["pinocchio", "lagrangian", "mujoco"])
-@pytest.mark.parametrize("method", FIXED)
-def test_a_batch_is_its_states_one_by_one(engine: str, method: str) -> None:
-    model, _, _ = tumbling()
-    dyn = dynamics(model, engine)
-    q, v = model.random_state(np.random.default_rng(1), 3)
-    tau = np.random.default_rng(2).standard_normal((3, 20, model.nv))
-    batch = simulate(dyn, q, v, 0.02, method, torque=tau)
-    assert batch.q.shape == (3, 21, model.nq)
-    assert batch.energy().shape == (3, 21)
-    for i in range(3):
-        one = simulate(dyn, q[i], v[i], 0.02, method, torque=tau[i])
-        assert batch.q[i] == pytest.approx(one.q, abs=1e-13)
-        assert batch.v[i] == pytest.approx(one.v, abs=1e-12)
-        assert batch.energy()[i] == pytest.approx(one.energy(), abs=1e-12)
-    assert batch.stats.steps == 60
-
-
-def test_one_state_beside_a_batch_and_an_empty_batch() -> None:
-    dyn = dynamics(catalog.pendulum())
-    run = simulate(dyn, [[0.1], [0.2]], [0.0], 0.01)
-    assert run.q.shape == (2, 11, 1)
-    assert simulate(dyn, np.empty((0, 1)), [0.0], 0.01).q.shape == (0, 11, 1)
-    native = simulate(dynamics(catalog.pendulum(), "mujoco"), np.empty((0, 1)), [0.0], 0.01, "mujoco_rk4")
-    assert native.q.shape == (0, 11, 1)
-    assert simulate(dyn, [[0.1], [0.2]], [0.0], 0.01, "dop853", save=[0, 0.01]).q.shape == (2, 2, 1)
-
-
 # Torques
 
 
@@ -527,55 +494,6 @@ def test_native_divergence_is_void_from_there(tmp_path: Path, monkeypatch: pytes
         alone = simulate(dyn, [1.0], [0.0], 0.1, "mujoco_euler")
     assert np.isfinite(alone.q).all()
     assert alone.t[-1] == alone.stats.reached < 0.1
-
-
-class _Broken(Dynamics):
-    """Closed-form pendulum whose engine fails past an angle; not in the registry."""
-
-    engine = "broken"
-
-    def _forward_dynamics(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        if np.any(q > 1.0):
-            raise NumericalError("broken: no acceleration past 1 rad")
-        return tau - 9.81 * np.sin(q)
-
-    def _mass_matrix(self, q: np.ndarray) -> np.ndarray:
-        return np.ones((*q.shape, 1))
-
-    def _potential_energy(self, q: np.ndarray) -> np.ndarray:
-        return np.asarray(-9.81 * np.cos(q[..., 0]))
-
-    def _other(self, *_: Any) -> np.ndarray:
-        raise NotImplementedError
-
-    _kinetic_energy = _gravity = _nle = _passive = _inverse_dynamics = _pose = _jacobian = _other
-
-
-@pytest.mark.parametrize("method", [*FIXED, "dop853"])
-def test_an_engine_that_fails_ends_the_run(method: str) -> None:
-    dyn = _Broken(catalog.pendulum())
-    with pytest.warns(MbkitWarning, match="no acceleration past 1 rad"):
-        run = simulate(dyn, [0.9], [2.0], 1.0, method)
-    assert run.stats.ended == "diverged"
-    assert 0.04 < run.stats.reached < 0.08  # type: ignore[operator]
-    assert run.q.max() <= 1.0 + 2e-3
-    with pytest.warns(MbkitWarning):
-        start = simulate(dyn, [1.1], [0.0], 1.0, method)
-    assert len(start.t) == 1
-    assert start.stats.reached == 0.0
-    # An engine outside the registry travels with its trajectory.
-    again = pickle.loads(pickle.dumps(simulate(dyn, [0.1], [0.0], 0.1, method)))
-    assert np.ptp(again.energy()) < 1e-3
-
-
-@pytest.mark.parametrize("method", [*FIXED, "dop853"])
-def test_a_rotation_that_overflows_is_a_divergence(method: str) -> None:
-    box = catalog.free_body()
-    with pytest.warns(MbkitWarning):
-        run = simulate(dynamics(box), box.neutral(), [0, 0, 0, 0, 0, 1e155], 1.0, method)
-    assert not run.stats.finished
-    assert len(run.t) < 3
-    assert np.isfinite(run.q).all()
 
 
 # Bad input

@@ -1,5 +1,5 @@
 # Torques have the signature they are called with.
-# ruff: noqa: ARG001, ARG005
+# ruff: noqa: ARG001, ARG002, ARG005
 """Every method meets bad input, torque functions that fail, interruption and divergence; none loses what it has."""
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ import mbkit as mb
 from mbkit import catalog
 from mbkit._check import finite_array
 from mbkit.engines import Dynamics, dynamics
-from mbkit.errors import InputError, MbkitWarning, TorqueError
+from mbkit.errors import InputError, MbkitWarning, NumericalError, TorqueError
 from mbkit.simulate import Event, simulate
 from mbkit.simulate.time_grid import Grid
-from tests.scenes import METHODS, slider
+from tests.scenes import METHODS, mounted, slider
 
 EPS = float(np.finfo(float).eps)
 ADAPTIVE = [m.name for m in METHODS.values() if m.kind == "adaptive"]
@@ -338,6 +338,35 @@ def test_same_input_same_bits(method: str) -> None:
     assert first.stats.steps == second.stats.steps
 
 
+# Batches
+
+#: How far a method's run of a few steps of 10 ms, or with a tolerance of 1e-9, may be from the motion.
+FAR = {"semi_implicit_euler": 0.05, "moreau": 0.05, "implicit_midpoint": 1e-3}
+
+
+@pytest.mark.thorough("True-gauss6", "True-auto", "True-dop853", "True-radau", "True-bdf", "True-lsoda")
+@pytest.mark.parametrize("method", [m.name for m in METHODS.values() if not m.engines or "lagrangian" in m.engines])
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_batch_is_its_members_with_torques_and_parameters_of_their_own(method: str, compiled: bool) -> None:
+    model = catalog.double_pendulum(mass1=mb.Parameter("m", 2.0))
+    dyn, masses, grid = dynamics(model, "lagrangian", compile=compiled), [0.5, 1.0, 3.0], np.linspace(0, 0.04, 5)
+    q, v = model.random_state(np.random.default_rng(0), 3)
+    torque = np.random.default_rng(1).standard_normal((3, 4, 2))
+    given = {"save": grid} | ({"dt": 0.01} if METHODS[method].kind == "fixed" else {"rtol": 1e-9})
+    many = simulate(dyn.at(m=masses), q, v, 0.04, method, torque=torque, **given)
+    assert np.array_equal(many.stats.reached, np.full(3, 0.04))
+    for i, mass in enumerate(masses):
+        one = simulate(dyn.at(m=mass), q[i], v[i], 0.04, method, torque=torque[i], **given)
+        assert np.abs(many.q[i] - one.q).max() <= 1e-12
+        assert np.abs(many.v[i] - one.v).max() <= 1e-11
+        plain = dynamics(catalog.double_pendulum(mass1=mass), "pinocchio")
+        truth = simulate(plain, q[i], v[i], 0.04, "dop853", rtol=1e-12, torque=torque[i], save=grid)
+        assert np.abs(one.q - truth.q).max() < FAR.get(method, 1e-6)
+    # One state beside a batch is repeated.
+    both = simulate(dyn.at(m=1.0), q[:2], v[1], 0.04, method, torque=torque[:2], **given)
+    assert np.abs(both.q[1] - many.q[1]).max() <= 1e-12
+
+
 # Divergence
 
 
@@ -365,6 +394,57 @@ def test_a_run_away_keeps_what_it_has_and_says_when(
     assert run.t[-1] <= run.stats.reached < 0.3
     assert np.isfinite(run.q).all()
     assert np.isfinite(run.v).all()
+
+
+class _Wall(Dynamics):
+    """A pendulum whose engine fails past 1 rad; not in the registry."""
+
+    engine = "wall"
+
+    def _forward_dynamics(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> np.ndarray:
+        if np.any(q > 1.0):
+            raise NumericalError("wall: no acceleration past 1 rad")
+        return tau - 9.81 * np.sin(q)
+
+    def _other(self, *_: Any) -> np.ndarray:
+        raise NotImplementedError
+
+    _mass_matrix = _potential_energy = _kinetic_energy = _gravity = _nle = _passive = _inverse_dynamics = _other
+    _pose = _jacobian = _other
+
+
+@pytest.mark.parametrize("method", [m for m in ASKING if not METHODS[m].engines])
+def test_an_engine_that_fails_ends_the_run_close_to_there(method: str, capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.warns(MbkitWarning, match=r"no acceleration past 1 rad") as heard:
+        run = simulate(_Wall(catalog.pendulum()), [0.9], [2.0], 1.0, method, rtol=1e-8 if method in ADAPTIVE else None)
+    assert len(heard) == 1
+    assert run.stats.ended == "diverged"
+    assert 0.04 < run.stats.reached < 0.06
+    assert 0.98 < run.q[-1, 0] <= 1.002
+    assert run.t[-1] == run.stats.reached
+    with pytest.warns(MbkitWarning):
+        assert simulate(_Wall(catalog.pendulum()), [1.1], [0.0], 1.0, method).stats.reached == 0.0
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("method", [m.name for m in METHODS.values() if not m.engines])
+def test_a_rotation_that_overflows_is_a_divergence(method: str, capfd: pytest.CaptureFixture[str]) -> None:
+    box = catalog.free_body()
+    for engine in ("lagrangian", "pinocchio"):
+        with pytest.warns(MbkitWarning, match=r"after t = 0(\.001)? s"):
+            run = simulate(dynamics(box, engine), box.neutral(), [0, 0, 0, 0, 0, 1e155], END, method, **saved(method))
+        assert run.stats.ended in ("diverged", "step_too_small")
+        assert len(run.t) < 3
+        assert np.isfinite(run.q).all()
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("method", [m.name for m in METHODS.values() if not m.engines or "lagrangian" in m.engines])
+def test_a_model_without_velocities_stands_still(method: str) -> None:
+    b = mounted("stone", "stone", "glue", "fixed", mass=1.0)
+    for compiled in (True, False):
+        run = simulate(dynamics(b.build(), "lagrangian", compile=compiled), [], [], END, method, **saved(method))
+        assert run.q.shape == (101, 0)
 
 
 @pytest.mark.thorough("auto", "rodas5", "radau", "bdf")

@@ -226,38 +226,6 @@ def test_every_way_to_run_gives_the_same(case: str, monkeypatch: pytest.MonkeyPa
         assert np.abs(run.v - one.v).max() <= 1e-11 * max(np.abs(v).max(), 1.0)
 
 
-def test_a_batch_is_its_members() -> None:
-    model = cases()["random tree"][0]
-    dyn = engine(model, compile=True)
-    rng = np.random.default_rng(0)
-    # More than go side by side, on every core.
-    n = 150
-    qs, vs = model.random_state(rng, n)
-    rows = rng.standard_normal((n, 50, model.nv))
-    batch = simulate(dyn, qs, vs, 0.5, METHOD, dt=0.01, torque=rows)
-    assert batch.stats.steps == n * 50
-    for i in (0, 74, 75, 149):
-        one = simulate(dyn, qs[i], vs[i], 0.5, METHOD, dt=0.01, torque=rows[i])
-        assert np.abs(one.q - batch.q[i]).max() <= 1e-12 * max(np.abs(one.q).max(), 1.0)
-    again = simulate(
-        LagrangianDynamics(model, compile=True, threads=1), qs, vs, 0.5, METHOD, dt=0.01, torque=rows, save=7
-    )
-    kept = [*range(0, 50, 7), 50]
-    assert np.array_equal(again.q, batch.q[:, kept])
-    assert np.array_equal(again.v, batch.v[:, kept])
-
-
-@pytest.mark.parametrize("compile", [True, False])
-def test_parameters_may_differ_in_a_batch(compile: bool) -> None:  # noqa: A002
-    model = catalog.double_pendulum(mass1=mb.Parameter("m", 2.0))
-    masses = np.array([0.5, 1.0, 3.0])
-    dyn = engine(model, compile=compile)
-    batch = simulate(dyn.at(m=masses), [0.5, 0.2], [0.0, 0.0], 1.0, METHOD, dt=0.01)
-    for i, m in enumerate(masses):
-        one = simulate(dyn.at(m=float(m)), [0.5, 0.2], [0.0, 0.0], 1.0, METHOD, dt=0.01)
-        assert np.abs(one.q - batch.q[i]).max() <= 1e-13
-
-
 def test_a_torque_function_acts_at_the_midpoint() -> None:
     model, q, v, duration = cases()["double pendulum"]
     dyn = engine(model)

@@ -192,7 +192,10 @@ def _outcome(problem: IntegrationProblem, method: Method) -> SolverResult:
     if method.dry_friction and "jump" not in dyn.model.effects:
         # Without jumps its step is that of this method.
         method = METHODS[EULER_METHOD]
-        problem = replace(problem, method=method.name)
+    elif method.kind == "adaptive" and not dyn.model.nv:
+        # Where nothing moves, other methods have no scale and no series.
+        method = METHODS[ADAPTIVE_METHOD]
+    problem = replace(problem, method=method.name)
     if dyn._soft_friction and method.dry_friction:
         raise UnsupportedError(
             f"{method.name}: solves exact dry friction, and {dyn.engine} was asked for its own; leave soft_friction out"
