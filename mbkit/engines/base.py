@@ -670,11 +670,16 @@ class WrenchedDynamics(Dynamics):
         return self._bare._evaluate("forward_dynamics_with_wrenches", *self._acting, **states)
 
 
-class MappedDynamics(FrameByFrame, Dynamics):
-    """An engine of single states with velocities of its own, v_engine = T v.
+def applied(A: Array, x: Array) -> Array:
+    """Return A x, of one state or a stack of them."""
+    return np.asarray((A @ x[..., None])[..., 0])
 
-    Entry i is full velocity `_v_index[i]`; then rotations, set with each state, turn three entries each. T is
-    orthogonal, so forces map as velocities do.
+
+class MappedDynamics(FrameByFrame, Dynamics):
+    """An engine with velocities of its own, v_engine = T v.
+
+    Entry i is full velocity `_v_index[i]`; then rotations, set with each state or stack of them, turn three entries
+    each. T is orthogonal, so forces map as velocities do.
     """
 
     _batches = False
@@ -694,27 +699,27 @@ class MappedDynamics(FrameByFrame, Dynamics):
         raise NotImplementedError
 
     def _to_engine(self, x: Array) -> Array:
-        """Return T x for velocities, accelerations or forces."""
-        out: Array = self.model.layout.expand_v(x)[self._v_index]
+        """Return T x for velocities, accelerations or forces, (..., nv)."""
+        out: Array = self.model.layout.expand_v(x)[..., self._v_index]
         for R, part in self._turned:
-            out[part] = R @ out[part]
+            out[..., part] = applied(R, out[..., part])
         return out
 
     def _columns(self, J: Array) -> Array:
-        """Return J T, in the description's order and reduced."""
+        """Return J T, (..., k, nv), in the description's order and reduced."""
         full = np.empty_like(J)
         if self._turned:
             J = J.copy()
         for R, part in self._turned:
-            J[:, part] = J[:, part] @ R
-        full[:, self._v_index] = J
+            J[..., part] = J[..., part] @ R
+        full[..., self._v_index] = J
         return np.asarray(full @ self.model.layout.G) if self.model.layout.reduced else full
 
     def _force(self, f: Array) -> Array:
         if self._turned or self.model.layout.reduced:
-            return np.asarray(self._columns(f[None, :])[0])
+            return np.asarray(self._columns(f[..., None, :])[..., 0, :])
         out = np.empty_like(f)
-        out[self._v_index] = f
+        out[..., self._v_index] = f
         return out
 
 

@@ -14,7 +14,7 @@ from mbkit import spatial
 from mbkit._attributes import forwarded
 from mbkit._check import Array
 from mbkit.engines import known_defects
-from mbkit.engines.base import MappedDynamics
+from mbkit.engines.base import MappedDynamics, applied
 from mbkit.engines.elements.passive import JointPassive, pull
 from mbkit.engines.frames_and_momenta import ALIGNED, seen_from
 from mbkit.engines.remote.description import REMOTE_RUNS, REMOTE_RUNS_OF_JOINTS, places, travelling
@@ -34,11 +34,6 @@ _REFUSED: Final = {
 #: A run by the engine's own integrator is left this often, s, for signals and progress; after so many steps first.
 _SIGNAL_PERIOD: Final = 0.1
 _FIRST_STEPS: Final = 16
-
-
-def _turn(R: Array, x: Array) -> Array:
-    """Return R x, of one state or a stack of them."""
-    return np.asarray((R @ x[..., None])[..., 0])
 
 
 def _each(function: Callable[..., Any], *states: Array) -> Any:
@@ -166,24 +161,8 @@ class VersionDynamics(MappedDynamics):
             if joint.type.nv > 3:
                 linear = slice(first + convention.linear, first + convention.linear + 3)
                 angular = slice(first + 3 - convention.linear, first + 6 - convention.linear)
-                b[..., linear] = _turn(R, np.cross(own[..., angular], own[..., linear]))
+                b[..., linear] = applied(R, np.cross(own[..., angular], own[..., linear]))
         return x, b if v is None else self._to_engine(v), b
-
-    def _to_engine(self, x: Array) -> Array:
-        out: Array = self.model.layout.expand_v(x)[..., self._v_index]
-        for R, part in self._turned:
-            out[..., part] = _turn(R, out[..., part])
-        return out
-
-    def _columns(self, J: Array) -> Array:
-        J, full = J.copy(), np.empty_like(J)
-        for R, part in self._turned:
-            J[..., part] = J[..., part] @ R
-        full[..., self._v_index] = J
-        return np.asarray(full @ self.model.layout.G) if self.model.layout.reduced else full
-
-    def _force(self, f: Array) -> Array:
-        return np.asarray(self._columns(f[..., None, :])[..., 0, :])
 
     def _method(self, quantity: str) -> Callable[..., Any]:
         if quantity.startswith(("coriolis", "kinetic")) and (defect := self._defects.get(quantity[:8])):
@@ -220,7 +199,7 @@ class VersionDynamics(MappedDynamics):
         """Return a force of velocities, and M b of the change of velocities."""
         x, u, b = self._native(q, v)
         out = self._ask(name, x, u)[0]
-        return self._force(out + _turn(self._ask("mass_matrix", x)[0], b) if b.any() else out)
+        return self._force(out + applied(self._ask("mass_matrix", x)[0], b) if b.any() else out)
 
     def _coriolis_force(self, q: Array, v: Array) -> Array:
         if "coriolis_force" not in self._gives:
@@ -248,8 +227,8 @@ class VersionDynamics(MappedDynamics):
         out = np.asarray(own @ layout.G)
         for spring, ends in self._ends.items():
             rates = np.diff(self._jacobian(q, ends, ALIGNED)[..., :3, :], axis=-3)[..., 0, :, :]
-            pulls = _each(partial(pull, spring), self._gap(q, ends), _turn(rates, v))
-            out = out - _turn(rates.mT, pulls)
+            pulls = _each(partial(pull, spring), self._gap(q, ends), applied(rates, v))
+            out = out - applied(rates.mT, pulls)
         return out
 
     def _gap(self, q: Array, ends: tuple[Frame, ...]) -> Array:
@@ -258,7 +237,7 @@ class VersionDynamics(MappedDynamics):
 
     def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
         if "inverse_dynamics" not in self._gives:
-            return _turn(self._mass_matrix(q), a) + self._nle(q, v) - self._passive(q, v)
+            return applied(self._mass_matrix(q), a) + self._nle(q, v) - self._passive(q, v)
         x, u, b = self._native(q, v)
         out = self._force(self._ask("inverse_dynamics", x, u, self._to_engine(a) + b)[0])
         rotors = 0.0 if self._rotors is None else a @ self._rotors

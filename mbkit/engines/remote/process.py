@@ -68,7 +68,7 @@ class EngineProcess(Child):
 
     def start(self) -> int:
         """Start the process unless it runs, and return its generation."""
-        with self._lock, self._told(_START_SECONDS):
+        with self._lock, self._translating_errors(_START_SECONDS):
             self._start(_START_SECONDS)
         return self.generation
 
@@ -80,14 +80,14 @@ class EngineProcess(Child):
         return [*map(str, command)], kept | self.version.variables()
 
     def _exchange(self, message: bytes, seconds: float) -> tuple[dict[str, Any], list[Array]]:
-        with self._told(seconds):
+        with self._translating_errors(seconds):
             self._send(message)
             answer = self._receive(deadline=time.perf_counter() + seconds)
         self._busy = False
         return serve.unpacked(answer)
 
     @contextlib.contextmanager
-    def _told(self, seconds: float) -> Iterator[None]:
+    def _translating_errors(self, seconds: float) -> Iterator[None]:
         """Raise what happens to the process as the errors of an engine."""
         try:
             yield
