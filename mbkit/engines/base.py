@@ -149,10 +149,6 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
     _acting: tuple[tuple[Frame, ...], str] = ((), LOCAL)
     #: The same dynamics without these wrenches, where there are some.
     _bare: Dynamics | None = None
-    # These stand in adapters.
-    _coriolis_matrix: Callable[..., Any]
-    _forward_dynamics: Callable[..., Any]
-    _inverse_dynamics_derivatives: Callable[..., Any]
 
     def __init__(self, model: Model) -> None:
         self._take(model)

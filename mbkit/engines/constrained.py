@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
@@ -13,11 +13,12 @@ from mbkit._check import Array, batch_of
 from mbkit._imports import from_above
 from mbkit._reproducible import dependent, unit_rows
 from mbkit._warn import warn
+from mbkit.engines.evaluation import Evaluation
 from mbkit.errors import InputError, MbkitWarning, NumericalError
 from mbkit.model.elements.paths import ALL, Path
 
 if TYPE_CHECKING:
-    from mbkit.model import Model
+    pass
 
 #: Residual of a consistent state beside each row's scale: rounding and a few typed digits.
 CONSISTENT: Final = 1e-8
@@ -59,7 +60,7 @@ def unwatched(*all_dynamics: Any) -> Iterator[None]:
             dyn._state_unchecked = unchecked
 
 
-class Constrained:
+class Constrained(Evaluation):
     """The part of `Dynamics` for models with loops, motions in time, blades, and wheels and spheres that roll.
 
     ::
@@ -81,18 +82,11 @@ class Constrained:
     of the constraints among theirs; every other term, such as `inverse_dynamics`, is that of the tree, without λ.
     """
 
-    model: Model
     #: Whether the engine lets constraints give way: its states are those of its own equations, and none is projected.
     _soft_constraints: bool = False
     #: Options with which the engine holds dry friction by its own soft law, and whether it does.
     _soft_friction_options: ClassVar[Mapping[str, Any]] = {}
     _soft_friction: bool = False
-    engine: ClassVar[str]
-    _state_unchecked: bool
-    _row_choice: Any
-    _evaluate: Callable[..., Array]
-    _without_friction: Callable[[str], Callable[..., Any]]
-    forward_dynamics: Callable[..., Array]
 
     def _friction_beside_passive(self, q: Array, v: Array, tau: Array) -> Array:  # noqa: ARG002  # of a soft law
         """Return the forces of dry friction in accelerations under τ, less those in `passive`; (N, nv)."""

@@ -22,6 +22,7 @@ from mbkit._check import SPATIAL as SPATIAL
 from mbkit._check import WORLD as WORLD
 from mbkit._check import Array
 from mbkit._check import axes_named as axes_named
+from mbkit.engines.evaluation import Evaluation
 from mbkit.errors import InputError
 from mbkit.model import Body, Frame, Model
 from mbkit.model.quantities import QUANTITIES, of_groups
@@ -68,7 +69,7 @@ class Parts(tuple[Any, ...]):
         return self is other
 
 
-class FramesAndMomenta:
+class FramesAndMomenta(Evaluation):
     """Motion of frames, centre of mass and momentum; `Dynamics` inherits it.
 
     Frames are named: those of the description, and bodies. A list of names gives one value for each, on an axis before
@@ -76,11 +77,7 @@ class FramesAndMomenta:
     world's frame is a value like any other.
     """
 
-    model: Model
-    _evaluate: Callable[..., Array]
-    _method: Callable[[str], Callable[..., Any]]
     _frames_held: dict[Any, tuple[Frame, ...]]
-    _matter: Any
 
     def _frames(self, frame: str | Sequence[str]) -> tuple[tuple[Frame, ...], bool]:
         """Return the frames, and whether it is one alone."""
@@ -363,16 +360,8 @@ class FramesAndMomenta:
         return self._evaluate("locked_inertia", q=q)
 
 
-class Composed:
+class Composed(Evaluation):
     """Quantities by formulas from an engine's other ones, for an engine that has no function of its own for them."""
-
-    model: Model
-    _mass_matrix: Callable[[Array], Array]
-    _pose: Callable[..., Array]
-    _velocity: Callable[..., Array]
-    _acceleration: Callable[..., Array]
-    _center_of_mass: Callable[[Array], Array]
-    _centroidal_momentum: Callable[[Array, Array], Array]
 
     def _mass_matrix_inverse(self, q: Array) -> Array:
         return np.asarray(np.linalg.inv(self._mass_matrix(q)))

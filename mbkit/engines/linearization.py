@@ -17,12 +17,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, arrays_shown, real
+from mbkit.engines.evaluation import Evaluation
 from mbkit.engines.steps import Slopes, differentiable_method, step_derivatives
 from mbkit.errors import InputError, NumericalError, UnsupportedError, require_known
 from mbkit.methods.registry import DEFAULT_METHOD, Method
@@ -216,19 +217,8 @@ def _blocks(rate: Array, by_q: Array, by_v: Array) -> Array:
     return A
 
 
-class LinearizationQuantities:
+class LinearizationQuantities(Evaluation):
     """The methods of `Dynamics` for control, for parameters, and of second order."""
-
-    # These stand in `Dynamics`.
-    engine: ClassVar[str]
-    model: Model
-    _samples: Any
-    _of_samples: Callable[..., Any]
-    _states: Callable[..., Any]
-    _value: Callable[..., Any]
-    _require_finite: Callable[..., None]
-    forward_dynamics: Callable[..., Array]
-    forward_dynamics_derivatives: Callable[..., Any]
 
     def linearize(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Linearization:
         """Return A, B and f of the motion near a state: ẋ = A x + B δτ.
@@ -267,7 +257,7 @@ class LinearizationQuantities:
         """
         LINEARIZE.admit(self.model)
         states, _ = self._states({"q": q, "v": v, "tau": tau})
-        a, by_q, by_v, by_tau, _ = self._forward_slopes(**states)
+        a, by_q, by_v, by_tau, _ = self._forward_slopes(states["q"], states["v"], states["tau"])
         moving, fixed = tangent_rate(self.model, states["q"], states["v"])
         n = self.model.nv
         B = np.zeros((*by_tau.shape[:-2], 2 * n, n))

@@ -18,9 +18,10 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, rows
 from mbkit.engines.elements.passive import pull
+from mbkit.engines.evaluation import Evaluation
 from mbkit.engines.frames_and_momenta import ALIGNED, CLASSICAL, LOCAL, Parts, axes_named, momentum_rates
 from mbkit.errors import InputError, require_known
-from mbkit.model import Frame, Joint, Model, PointSpring
+from mbkit.model import Frame, Joint, PointSpring
 from mbkit.model.elements.kinds import that_do
 from mbkit.model.elements.paths import Path
 from mbkit.model.parts import Loop
@@ -42,31 +43,13 @@ LOADS: Final = Path(
 )
 
 
-class Loads:
+class Loads(Evaluation):
     """Wrenches on bodies and in joints; `Dynamics` inherits it."""
 
     #: Those of inverse and forward dynamics whose methods take wrenches, frames and axes behind their arguments.
     _takes_wrenches: ClassVar[tuple[str, ...]] = ()
-    model: Model
-    _evaluate: Callable[..., Array]
-    # These stand in the other parts of `Dynamics`.
-    _mass_matrix: Callable[[Array], Array]
-    _inverse_dynamics: Callable[..., Any]
-    _forward_dynamics: Callable[..., Any]
-    _jacobian: Callable[..., Array]
     _frames: Callable[..., tuple[tuple[Frame, ...], bool]]
-    forward_dynamics: Callable[..., Array]
-    acceleration: Callable[..., Array]
-    velocity: Callable[..., Array]
-    pose: Callable[..., Array]
-    body_poses: Callable[[ArrayLike], Array]
-    loop_wrenches: Callable[..., Array]
     _loads_under: Callable[..., Array]
-
-    @property
-    def _samples(self) -> int | None:
-        """Size of the batch that the parameters' values make, None where every sample has the same."""
-        return None
 
     def _stacked_wrenches(self, wrenches: Wrenches) -> tuple[tuple[Frame, ...], Array]:
         """Return the frames, and the wrenches one behind the other, (6 k,) or (N, 6 k)."""

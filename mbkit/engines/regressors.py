@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array
+from mbkit.engines.evaluation import Evaluation
 from mbkit.model.base_parameters import PARAMETER_SETS, RegressorColumns, regressor_columns
 
 if TYPE_CHECKING:
-    from mbkit.model import Model
+    pass
 
 _STANDARD: Final = PARAMETER_SETS[0]
 
@@ -23,7 +23,7 @@ def with_joints(Y: Array, columns: RegressorColumns, v: Array, rate: Array) -> A
     return np.hstack([Y[:, list(columns.bodies)], *(np.diag(x)[:, which] for x, which in own)])
 
 
-class Regressors:
+class Regressors(Evaluation):
     """The part of `Dynamics` that is linear in the inertial parameters of the bodies.
 
     The standard parameters π are ``model.base_parameters().standard``: of each body, in the order of the tree, Ixx,
@@ -32,9 +32,6 @@ class Regressors:
     parameters are ``model.base_parameters().values``; their columns are those of the standard parameters that lead
     them.
     """
-
-    model: Model
-    _evaluate: Callable[..., Array]
 
     def regressor(
         self,

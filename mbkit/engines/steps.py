@@ -8,7 +8,7 @@ derivatives of what rotates. Stages that are solved for are differentiated by th
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import EPS, Array, batch_of, real, real_array, require_finite
 from mbkit._imports import from_above
 from mbkit.engines.constrained import unwatched
+from mbkit.engines.evaluation import Evaluation
 from mbkit.engines.frames_and_momenta import ALIGNED, axes_named
 from mbkit.engines.loads import Wrenches
 from mbkit.errors import InputError, NumericalError, UnsupportedError
@@ -47,22 +48,10 @@ _MAX_NEWTON_ITERATIONS: Final = 25
 _STALLED_CORRECTION: Final = 1e-11
 
 
-class Steps:
+class Steps(Evaluation):
     """The method of `Dynamics` that takes a step."""
 
-    # These stand in `Dynamics`.
-    engine: ClassVar[str]
-    model: Model
-    _step_unchecked: bool
     _states_held: Any
-    _soft_friction: bool
-    at: Callable[..., Any]
-    forward_dynamics: Callable[..., Array]
-    _stacked_wrenches: Callable[..., Any]
-    _under: Callable[..., Any]
-    _method: Callable[..., Any]
-    _states: Callable[..., Any]
-    _of_sample: Callable[[int], Any]
 
     def step(
         self,

@@ -11,7 +11,7 @@ independent actuators). That with the least norm is taken, and Jᵀ λ is what i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -54,13 +54,6 @@ class ActuatorForces(NamedTuple):
 
 class Actuation(Constrained):
     """The part of `Dynamics` for forces of actuators under constraints."""
-
-    # Of the other parts of `Dynamics`.
-    _of_samples: Callable[..., Any]
-    _method: Callable[[str], Callable[..., Any]]
-    _inverse_dynamics: Callable[..., Array]
-    _constraint_jacobian: Callable[[Array], Array]
-    _constraint_bias: Callable[[Array, Array], Array]
 
     def actuator_forces(
         self, q: ArrayLike, v: ArrayLike, a: ArrayLike, actuators: str | Sequence[str] = LEAST

@@ -11,7 +11,7 @@ one with the least norm over all rows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -55,11 +55,6 @@ class UndeterminedLoads(NamedTuple):
 
 class LoopLoads(Actuation, Loads):
     """The part of `Dynamics` for loads of mechanisms."""
-
-    # Of the other parts of `Dynamics`.
-    _pose: Callable[..., Array]
-    _joint_wrenches: Callable[..., Array]
-    _every_jacobian: Callable[[Array], Array]
 
     def loop_wrenches(
         self, q: ArrayLike, v: ArrayLike, tau: ArrayLike, wrenches: Any = None, axes: str = ALIGNED

@@ -12,7 +12,7 @@ So derivatives come from terms that every engine has, and nothing is differenced
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -58,11 +58,6 @@ class ReducedInertia(NamedTuple):
 
 class IndependentMotion(LoopLoads):
     """The part of `Dynamics` for motion seen from independent coordinates."""
-
-    # Of the other parts of `Dynamics`.
-    mass_matrix: Callable[[ArrayLike], Array]
-    coriolis_force: Callable[[ArrayLike, ArrayLike], Array]
-    nle: Callable[[ArrayLike, ArrayLike], Array]
 
     def reduced_inertia(self, q: ArrayLike, coordinates: str | Sequence[str]) -> ReducedInertia:
         """Return the inertia that independent coordinates of a mechanism feel, and its derivatives.
