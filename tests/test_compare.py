@@ -39,6 +39,7 @@ from mbkit.studies.compare.errors import (
     matrix_errors,
 )
 from mbkit.studies.compare.findings import findings
+from mbkit.studies.compare.rows import RolloutRow
 from mbkit.studies.compare.terms import TERMS
 from mbkit.studies.compare.terms import states as study_states
 from mbkit.testing import assert_engines_agree
@@ -778,3 +779,46 @@ def test_rows_that_follow_from_others_have_no_condition(ratio, counts):
     J = np.array([[[1.0, 0.0], [math.cos(d), math.sin(d)]]])
     (condition,) = condition_under_constraints(np.eye(2)[None], J)
     assert condition == pytest.approx(1 / ratio, rel=1e-3) if counts else condition < 10
+
+
+def rollout_row(steps: int, error: float, condition: float) -> RolloutRow:
+    """A run that is off by so much from MuJoCo's after so many well-conditioned steps."""
+    dyn, q = mb.dynamics(hinge().build()), np.zeros((steps + 1, 1))
+    stats = SimpleNamespace(message="", seconds=0.1)
+    theirs = SimpleNamespace(q=q, method="mujoco_rk4", stats=stats)
+    ours = SimpleNamespace(q=q + error, t=1e-3 * np.arange(steps + 1), method="rk4", engine="pinocchio", stats=stats)
+    return beyond_terms._row(dyn, ours, theirs, np.full(steps + 1, condition), True, 1.0, "")
+
+
+@pytest.mark.parametrize(("part", "passed"), [(0.5, True), (2.0, False)])
+def test_a_rollout_may_differ_by_256_roundings_times_its_condition(part, passed):
+    row = rollout_row(60, part * 256 * 2.0**-52 * 1e3, 1e3)
+    assert (row.judged, row.passed) == (True, passed)
+    assert (rollout_row(40, 1.0, 1e3).judged, rollout_row(40, 1.0, 1e3).passed) == (False, None)
+
+
+def test_a_rollout_ends_where_its_condition_hides_an_error_of_1e_9(monkeypatch):
+    limit = 1e-9 / (256 * 2.0**-52)
+    grows = np.where(np.arange(1001) <= 300, limit / 2, 2 * limit)
+    monkeypatch.setattr(beyond_terms, "_condition", lambda *_: grows)
+    model = hinge().build()
+    rows = rollouts(model, {e: mb.dynamics(model, e) for e in ("pinocchio", "mujoco")}, 0, "")
+    assert {round(row.duration, 9) for row in rows} == {0.3}
+    assert all(row.cut and row.judged for row in rows)
+
+
+@pytest.mark.parametrize(("change", "unchanged"), [(3e-10, True), (3e-9, False)])
+def test_a_change_of_accelerations_beyond_1e_9_is_a_change(monkeypatch, change, unchanged):
+    from mbkit.engines.mujoco.engine import Variant
+
+    made, accelerations = Variant.__init__, Variant.accelerations
+
+    def make(self, dyn, bits=(), **more):
+        made(self, dyn, bits, **more)
+        self.factor = 1 + change * bool(bits)
+
+    monkeypatch.setattr(Variant, "__init__", make)
+    monkeypatch.setattr(Variant, "accelerations", lambda self, q, v: self.factor * accelerations(self, q, v))
+    model = hinge().build()
+    rows = beyond_terms.omissions(model, {"mujoco": mb.dynamics(model, "mujoco")}, 0)
+    assert {o.unchanged for o in rows if o.need in ("contacts", "limits")} == {unchanged}

@@ -30,19 +30,19 @@ from mbkit.studies.compare.terms import JOINT_LOADS, LoadsUnderForce, States, Te
 WRENCH: Final = (3.0, -2.0, 5.0, 0.4, 0.7, -0.3)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BodyScales(Scales):
     """Scales of the errors of bodies, per sample."""
 
-    columns: Array = None  # type: ignore[assignment]  # (N, 2, nv), norms of J's linear and angular columns
-    velocity: Array = None  # type: ignore[assignment]  # (N, 2), U and W of the frame
-    acceleration: Array = None  # type: ignore[assignment]  # (N, 2), of the frame
-    reach: Array = None  # type: ignore[assignment]  # (N,), length of the longest branch
-    curved: Array = None  # type: ignore[assignment]  # (N,), force on all matter where velocities bend the frame's way
-    force: Array = None  # type: ignore[assignment]  # (N,), and where it is accelerated, with its weight
-    mass: float = 0.0
-    spread: Array = None  # type: ignore[assignment]  # (N,), trace of the inertia about the world's origin
-    speeds: Array = None  # type: ignore[assignment]  # (N, nv), v
+    columns: Array  # (N, 2, nv), norms of J's linear and angular columns
+    velocity: Array  # (N, 2), U and W of the frame
+    acceleration: Array  # (N, 2), of the frame
+    reach: Array  # (N,), length of the longest branch
+    curved: Array  # (N,), force on all matter where velocities bend the frame's way
+    force: Array  # (N,), and where it is accelerated, with its weight
+    mass: float
+    spread: Array  # (N,), trace of the inertia about the world's origin
+    speeds: Array  # (N, nv), v
 
     @classmethod
     def around(cls, scales: Scales, oracle: OracleDynamics, at: States) -> BodyScales:
