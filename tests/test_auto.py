@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import pickle
 import re
 import warnings
 from types import SimpleNamespace
@@ -319,30 +318,6 @@ def test_each_of_a_batch_is_decided_on_by_itself() -> None:
         simulate(COMPILED, np.zeros((2, 2)), [0.0, 0.0], 1.0, "auto")
 
 
-@pytest.mark.thorough
-def test_every_joint_kind_moves_as_with_rk853() -> None:
-    model = random_tree(5, 8, SOUND)
-    q, v = model.random_state(np.random.default_rng(1))
-    stiff = np.full(model.nv, 1e5)
-    dyn = dynamics(model, "pinocchio")
-    torque = lambda t, q, v: -stiff * v  # noqa: E731
-    run, other = (simulate(dyn, q, v, 0.05, m, rtol=1e-8, torque=torque, save=[0.05]) for m in ("auto", "rodas5"))
-    assert np.abs(model.difference(run.q[-1], other.q[-1])).max() < 1e-7
-    model.check_q(run.q)
-
-
-# Twice, and elsewhere
-
-
-def test_a_run_repeats_to_the_bit_and_travels() -> None:
-    runs = [simulate(COMPILED, *START, "auto", rtol=1e-8) for _ in range(2)]
-    assert same(*runs)
-    assert runs[0].stats.chosen == runs[1].stats.chosen
-    sent = pickle.loads(pickle.dumps(runs[0]))
-    assert same(sent, runs[0])
-    assert sent.stats == runs[0].stats
-
-
 # What goes wrong
 
 
@@ -409,17 +384,6 @@ def test_what_cannot_go_on_says_so_once() -> None:
     assert 0.2 < told.value.trajectory.t[-1] <= 0.3
 
 
-def test_bad_input_is_named() -> None:
-    with pytest.raises(InputError, match="rtol: expected at least"):
-        simulate(INTERPRETED, *START, "auto", rtol=1e-17)
-    with pytest.raises(InputError, match="save: expected a grid of times for an adaptive method"):
-        simulate(INTERPRETED, *START, "auto", save=3)
-    still = simulate(INTERPRETED, [1.0, 0.0], [0.0, 0.0], 0.0, "auto")
-    assert still.q.shape == (1, 2)
-    none = simulate(INTERPRETED, np.empty((0, 2)), [0.0, 0.0], 1.0, "auto", save=SAVE, doubt=False)
-    assert none.q.shape == (0, 9, 2)
-
-
 def test_the_pace_is_that_of_the_later_half() -> None:
     gauge = StepRateMonitor(0.0, 2)
     for k in range(8):
@@ -482,12 +446,6 @@ def test_the_bound_comes_first_and_bad_input_is_named() -> None:
         stiffness("beam", q, q)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="empty batch"):
         stiffness(dyn, np.empty((0, 12)), q)
-
-
-def test_nothing_is_said_where_all_is_well() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        simulate(COMPILED, *START, "auto", rtol=1e-8)
 
 
 def test_a_batch_tells_its_three_commonest_sequences_of_methods():

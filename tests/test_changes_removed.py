@@ -139,16 +139,6 @@ def test_a_mimic_joint_is_independent_again():
         assert off(a, c) < CLOSE
 
 
-def test_a_parameter_of_a_mimic_joint_goes_with_it():
-    b = plain()
-    b.set_joint("hinge1", mimic=("hinge0", mb.Parameter("gear", 2.0), 0.0))
-    assert b.build().parameters == {"gear": 2.0}
-    b = mb.ModelBuilder.of(b.build())
-    b.set_joint("hinge1", mimic=None)
-    assert not b.build().parameters
-    assert b.build().digest == plain().build().digest
-
-
 @pytest.mark.parametrize(
     ("mimic", "words"),
     [

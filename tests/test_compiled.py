@@ -340,30 +340,6 @@ def test_options_are_checked_and_kept():
     assert dyn.threads == 1
 
 
-def test_one_function_serves_all_who_ask_in_a_process(tmp_path, monkeypatch):
-    monkeypatch.setenv("MBKIT_CACHE_DIR", str(tmp_path))
-    made = []
-
-    def make() -> ca.Function:
-        made.append(1)
-        return sines()
-
-    first = compiled(("one function",), make)
-    assert compiled(("one function",), make) is first
-    assert len(made) == 1
-
-
-def test_a_far_angle_leaves_its_neighbours_as_they_are():
-    x = np.random.default_rng(5).uniform(-np.pi, np.pi, (4000, 1))
-    code = built(sines())
-    alone = code(x)[0]
-    far = x.copy()
-    far[::3] = 1e9
-    # The C library rounds some of the others differently.
-    near = np.arange(len(x)) % 3 != 0
-    np.testing.assert_array_equal(code(far)[0][near], alone[near])
-
-
 @cache
 def _sums() -> ca.Function:
     x = ca.SX.sym("x", 40)

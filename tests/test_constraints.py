@@ -100,16 +100,6 @@ def test_equations_show_multipliers_and_the_constraint(rod):
     assert sp.simplify(second.subs(plain).subs(named) - driven.constraint_acceleration[0]) == 0
 
 
-def test_oracle_and_machine_code_agree(rod):
-    q, v = on_circle(0.7, -1.1)
-    tau = [0.3, -0.2]
-    exact = rod.dynamics("oracle").forward_dynamics(q, v, tau)
-    for compile_ in (False, True):
-        own = rod.dynamics(options={"compile": compile_})
-        assert np.abs(own.forward_dynamics(q, v, tau) - exact).max() < 1e-14
-        assert np.abs(rod.constraint_jacobian(q) @ exact + v @ v) < 1e-13
-
-
 def test_derivatives_are_those_of_the_constrained_acceleration(rod):
     q, v = on_circle(0.7, -1.1)
     dyn, tau, h = rod.dynamics(options=OWN), np.array([0.3, -0.2]), 1e-6
@@ -200,18 +190,6 @@ def test_project_returns_the_nearest_state():
     angles = np.linspace(0, 2 * np.pi, 100_001)
     around = np.column_stack([2 * np.cos(angles), np.sin(angles)]) - start
     assert (q - start) @ M @ (q - start) <= np.einsum("ni,ij,nj->n", around, M, around).min() + 1e-12
-
-
-def test_projecting_a_consistent_state_leaves_it(rod):
-    q, v = on_circle(0.3, 2.0)
-    for there, here in zip(rod.project(q, v), (q, v), strict=True):
-        assert np.abs(there - here).max() < 1e-15
-
-
-def test_random_states_are_consistent(rod):
-    q, v = rod.model.random_state(np.random.default_rng(0), 5)
-    assert np.abs(rod.constraint(q)).max() < 1e-14
-    assert np.abs(np.einsum("nmi,ni->nm", rod.constraint_jacobian(q), v)).max() < 1e-14
 
 
 @pytest.mark.parametrize("on", ["multipliers", "embedded"])
@@ -700,23 +678,6 @@ def test_pendulum_with_a_driven_pivot_by_multipliers_and_embedded():
         run = mb.simulate(dyn, q, v, 1.0, method, rtol=1e-12, save=save)
         assert np.abs(run.q[:, 0] - 1.5 * np.sin(angle)).max() < 1e-9
         assert drift(lag, run)[0] < DRIFT
-
-
-def test_no_warning_without_reason(rod):
-    q, v = on_circle(0.4, 0.5)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        mb.simulate(rod.embedded(), q, v, 0.5, "rk853")
-        mb.simulate(rod.dynamics(options=OWN), q, v, 0.5, "rk4", dt=0.01)
-
-
-def test_four_bar_conserves_energy_on_both_forms():
-    lag = four_bar()
-    q, v = lag.project([1.2, 0.3, 1.6], [1.0, 0.0, 0.0])
-    own = mb.simulate(lag.dynamics(options=OWN), q, v, 1.0, "rk853", rtol=1e-12, save=[0.0, 0.5, 1.0])
-    other = mb.simulate(lag.embedded(), q, v, 1.0, "rk853", rtol=1e-12, save=[0.0, 0.5, 1.0])
-    assert np.ptp(own.energy()) < 1e-9
-    assert np.abs(own.q - other.q).max() < 1e-9
 
 
 @pytest.mark.thorough("dynamics-gauss4", "embedded-rk4", "embedded-rk853")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import pickle
 import re
 import warnings
 from pathlib import Path
@@ -16,7 +15,7 @@ from scipy.optimize import brentq, lsq_linear
 
 import mbkit as mb
 from mbkit.engines.elements.dry_friction import forces_at_rest
-from mbkit.errors import InputError, MbkitWarning, ModelError, TorqueError, UnsupportedError
+from mbkit.errors import InputError, MbkitWarning, ModelError, TorqueError
 from mbkit.lagrangian.printing.summary import SystemSummary, python_code
 from mbkit.model import Model
 from mbkit.model.changes.dry_friction import held_at_rest
@@ -205,24 +204,6 @@ def test_engines_agree_with_the_oracle_at_rest(seed: int, kinds: tuple[str, ...]
         assert ((a == 0) == (exact == 0)).all(), engine
 
 
-@pytest.mark.parametrize("engine", [*ENGINES, "oracle"])
-def test_batches_are_their_samples_one_by_one(engine: str) -> None:
-    model = rubbed(4, 5)
-    q, v, tau = mostly_at_rest(model, 4)
-    dyn = mb.dynamics(model, engine)
-    alone = [dyn.forward_dynamics(*x) for x in zip(q, v, tau, strict=True)]
-    assert off(np.asarray(dyn.forward_dynamics(q, v, tau), dtype=float), np.asarray(alone, dtype=float)) < 1e4 * EPS
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_wrench_moves_what_rests_as_its_generalized_force_does(engine: str) -> None:
-    model = rubbed(1, 5)
-    q, v, tau = (x[0] for x in mostly_at_rest(model, 1))
-    dyn, push = mb.dynamics(model, engine), {"tip": np.array([3.0, -2.0, 5.0, 1.0, 2.0, -1.0])}
-    force = dyn.generalized_force(q, push)
-    assert off(dyn.forward_dynamics(q, v, tau, wrenches=push), dyn.forward_dynamics(q, v, tau + force)) < 1e5 * EPS
-
-
 @settings(max_examples=150)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 8), st.integers(0, 8), st.sampled_from([0.0, 1e-3, 1.0, 1e3]))
 # Exchanges of a singular A come back to where they were.
@@ -292,30 +273,6 @@ def four_bar(friction: np.ndarray) -> Model:
     ends = {"translation_a": (0.9, 0, 0), "translation_b": (0.7, 0, 0)}
     b.add_loop("pin", "point", body_a="coupler", body_b="rocker", **ends)
     return b.build()
-
-
-# What is without it
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_without_it_every_number_is_that_of_the_bare_model(engine: str) -> None:
-    bare = random_tree(0, 6, IN_MUJOCO, mimic=True)
-    model = rubbed(0, mimic=True).without("friction")
-    assert not model.needs.friction
-    q, v, tau = mostly_at_rest(bare, 4)
-    for name, args in (("forward_dynamics", (q, v, tau)), ("inverse_dynamics", (q, v, tau)), ("passive", (q, v))):
-        ours, theirs = (getattr(mb.dynamics(m, engine), name)(*args) for m in (model, bare))
-        np.testing.assert_array_equal(ours, theirs)
-
-
-def test_a_model_with_friction_outlives_pickling_and_building_again() -> None:
-    model = rubbed(1)
-    assert pickle.loads(pickle.dumps(model)) == model
-    assert mb.ModelBuilder.of(model).build() == model
-    q, v, tau = mostly_at_rest(model, 3)
-    dyn = mb.dynamics(model, "lagrangian")
-    a = dyn.forward_dynamics(q, v, tau)
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(dyn)).forward_dynamics(q, v, tau), a)
 
 
 # Runs
@@ -602,11 +559,6 @@ def test_samples_of_a_batch_have_their_own_parameters() -> None:
             assert off(together.q[i], alone.q) < 1e-11
             times = [e.t for e in together.events if e.member == i]
             assert times == pytest.approx([e.t for e in alone.events], rel=4 * EPS, abs=0)
-
-
-def test_runs_by_an_engine_s_own_integrator_are_refused_with_a_way_out() -> None:
-    with pytest.raises(UnsupportedError, match=r"does not know dry friction.*without\('friction'\)"):
-        mb.simulate(mb.dynamics(slider(friction=1.0), "mujoco"), [1.0], [0.0], 0.1, "mujoco_rk4", dt=1e-2)
 
 
 # Files and builders

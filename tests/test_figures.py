@@ -190,16 +190,6 @@ def test_coordinates_of_a_system_on_paper_are_not_called_lengths() -> None:
     assert not any("lengths" in label for label in labels)
 
 
-def test_a_run_is_drawn_into_a_subfigure() -> None:
-    figure = Figure(layout="constrained")
-    left, right = figure.subfigures(1, 2)
-    assert RUNS["double pendulum"]().plot(fig=right) is figure
-    assert len(right.axes) == 4
-    assert not left.axes
-    own = Figure()
-    assert RUNS["double pendulum"]().plot(own) is own
-
-
 # Comparisons, and tables of runs
 
 

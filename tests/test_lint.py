@@ -592,17 +592,6 @@ def test_the_command_ends_by_what_it_found(tmp_path):
     assert call("pendulum").exit_code == 0
 
 
-def test_check_says_that_engines_judge_no_file(tmp_path):
-    path = write(tmp_path, Link("a", density=1e3 * checks.LEAD_DENSITY), Link("b", "a"))
-    arguments = ["check", str(path), "--no-rollouts", "--samples", "2", "--json", "--out", str(tmp_path / "out")]
-    result = CliRunner().invoke(cli, arguments)
-    assert result.exit_code == 0, result.output
-    last = json.loads(result.stdout)["findings"][-1]
-    assert last["kind"] == "the file itself"
-    assert last["says"].startswith("no engine judges it: 1 finding on 2 links")
-    assert (last["joints"], last["size"]) == (["a"], 1)
-
-
 def test_the_assert_names_the_number_and_can_ignore(tmp_path):
     path = write(
         tmp_path, Link("a", density=1e3 * checks.LEAD_DENSITY), Link("b", "a", density=1.5 * checks.LEAD_DENSITY)

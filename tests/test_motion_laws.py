@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import pickle
 from dataclasses import replace
 from fractions import Fraction
 from typing import Any
@@ -17,7 +16,7 @@ from scipy.interpolate import BSpline, CubicSpline, PchipInterpolator, PPoly, ma
 
 import mbkit as mb
 from mbkit.cli import cli
-from mbkit.errors import InputError, ModelError, UnsupportedError
+from mbkit.errors import InputError, ModelError
 from tests.scenes import chain, hinge, linkage
 
 MASS, LENGTH, MOMENT, G = 2.0, 0.7, 0.05, 9.81
@@ -294,24 +293,6 @@ def test_tables_without_a_common_time_are_refused() -> None:
 
 
 # The description
-
-
-def test_a_description_with_laws_is_plain_data_and_refused_by_name_where_nothing_moves() -> None:
-    digests = set()
-    for model, _ in LAWS.values():
-        again = pickle.loads(pickle.dumps(model))
-        assert again == model
-        assert again.prescribed == model.prescribed
-        digests.add(model.digest)
-        bare = model.without("prescribed")
-        assert not bare.prescribed
-        assert not bare.needs.time
-        for refused in (lambda m: mb.dynamics(m, "mujoco"), lambda m: mb.convert(m, "urdf")):
-            with pytest.raises(UnsupportedError, match="'hinge' is moved in time"):
-                refused(model)
-    assert len(digests) == len(LAWS)
-    moved = pendulum((TIMES, [*VALUES[:-1], 0.91]))
-    assert moved.digest != LAWS["table"][0].digest
 
 
 def test_coordinates_that_follow_a_table_are_filled_in_where_it_is_drawn() -> None:

@@ -308,13 +308,6 @@ def test_equal_cranks_move_as_one(engine: str) -> None:
     assert closed == pytest.approx(closed[0] * one, rel=1e-13)
 
 
-def test_a_linearization_has_the_swing() -> None:
-    dyn = mb.dynamics(cranks(0.0), "lagrangian", compile=False)
-    slopes = dyn.forward_dynamics_derivatives(np.zeros(4), np.zeros(4), np.zeros(4))
-    one = np.array([1.0, 1.0, 1.0, -1.0])
-    assert slopes.q @ one == pytest.approx(swing(1e-8) / 1e-8 * one, rel=1e-12)
-
-
 @pytest.mark.thorough("rodas5", "gauss4", "implicit_midpoint", "dop853", "taylor")
 @pytest.mark.parametrize(
     "method", ["rk853", "auto", "rk4", "gauss6", "taylor", "dop853", "rodas5", "gauss4", "implicit_midpoint"]
@@ -375,18 +368,6 @@ def test_dry_friction_at_rest_knows_the_branch_of_redundant_rows(engine: str) ->
             NumericalError, match=r"singular pose, where .*loop 'loop2' x depend on each other, and at rest"
         ):
             mb.simulate(dyn, other, still, 0.1, "rk853")
-
-
-def test_the_digits_of_an_acceleration_under_redundant_rows_are_its_own() -> None:
-    # As many rows as velocities, so that the shapes tell nothing.
-    oracle, q, v = mb.dynamics(mb.catalog.bricard(), "oracle"), np.zeros(6), np.zeros(6)
-    high, low = oracle.extended("forward_dynamics", q, v, np.ones(6))
-    assert np.array_equal(high, oracle.forward_dynamics(q, v, np.ones(6)))
-    assert np.abs(low).max() < EPS * np.abs(high).max()
-    assert high == pytest.approx(high[0] * np.ones(6), rel=1e-14)
-    wrenches = {"bar1": np.ones(6)}
-    high, _ = oracle.extended("forward_dynamics", q, v, np.ones(6), wrenches)
-    assert np.array_equal(high, oracle.forward_dynamics(q, v, np.ones(6), wrenches))
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -69,15 +69,6 @@ def run(system: Lagrangian, q, v, duration=2.0, save=None, **values):
 # What is kept
 
 
-def test_cyclic_coordinates_and_their_momenta():
-    top = heavy_top()
-    assert top.cyclic_coordinates() == (phi, psi)
-    momenta = top.conserved_momenta()
-    assert sp.simplify(momenta[psi] - C * (s + u * sp.cos(theta))) == 0
-    assert sp.simplify(momenta[phi] - A * sp.sin(theta) ** 2 * u - momenta[psi] * sp.cos(theta)) == 0
-    assert [x.name for x in top.conserved_quantities()] == ["p_phi", "p_psi", "E"]
-
-
 @pytest.mark.parametrize(
     "acting",
     [{"forces": {phi: F}}, {"dissipation": F * u**2}, {"constraints": [phi - theta]}],
