@@ -20,6 +20,7 @@ from mbkit.engines.mujoco import importer
 from mbkit.errors import KnownDefectWarning, ModelError, UnsupportedError
 from mbkit.model import JointCoupling, Model, ModelBuilder
 from mbkit.model.validation import sample_mass_matrix
+from mbkit.studies.baseline.description import described
 from tests.random_trees import ALL, SOUND, random_tree
 
 EPS = np.finfo(float).eps
@@ -500,3 +501,11 @@ def test_the_importer_of_mujoco_reads_the_same(seed, tmp_path):
         assert_near(mb.dynamics(model, "pinocchio").passive(q, v), other.passive(q, v))
     assert [c.name for c in model.couplings] == [c.name for c in imported.couplings]
     assert [s.name for s in model.springs] == [s.name for s in imported.springs]
+
+
+def test_a_difference_in_a_coupling_is_named():
+    model, other = (two_pendulums(armature=x).build() for x in (0.5, 0.75))
+    (cause,) = mb.explain(model, other).causes
+    assert cause.acts
+    assert "'c'" in cause.subject
+    assert described(model)["couplings"]["c"]["armature"] == 0.5

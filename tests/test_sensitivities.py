@@ -11,6 +11,7 @@ import pytest
 import mbkit as mb
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from tests.random_trees import random_tree, states
+from tests.scenes import mounted
 
 EPS = np.finfo(float).eps
 
@@ -156,3 +157,11 @@ def test_a_force_of_the_time_is_refused_as_one():
     ):
         with pytest.raises(UnsupportedError, match="terms that depend on the time"):
             call()
+
+
+def test_of_a_model_that_cannot_move():
+    b = mounted("wall", "brick", "mortar", "fixed", mass=1.0)
+    dyn = mb.dynamics(b.build(), "lagrangian")
+    assert mb.sensitivities(dyn, [], [], 0.1, dt=0.05).state.shape == (3, 0, 0)
+    assert dyn.linearize([], [], []).discretize(0.1).A.shape == (0, 0)
+    assert dyn.discretize([], [], [], 0.1, "implicit_midpoint").A.shape == (0, 0)
