@@ -25,7 +25,8 @@ from mbkit.load.urdf_reader import urdf_links
 from mbkit.load.xml_reader import Element
 from mbkit.report.page import render
 from mbkit.studies.explain.result import meaning
-from mbkit.studies.importers.result import MISSING, TERMS
+from mbkit.studies.explain.terms import TERMS
+from mbkit.studies.importers.result import MISSING
 
 LINK = (
     '<link name="{0}"><inertial><origin xyz="0 0.01 0.1" rpy="0.1 0 0"/><mass value="{1}"/>'

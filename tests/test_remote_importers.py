@@ -11,7 +11,7 @@ from mbkit._child_process import end_all
 from mbkit.engines.remote import importer
 from mbkit.engines.remote.packages import PACKAGES, EngineVersion, Package, register_remote_engine
 from mbkit.errors import InputError, UnknownNameError
-from mbkit.studies.importers.result import TERMS
+from mbkit.studies.explain.terms import TERMS
 from mbkit.studies.importers.study import _SINGLE_TOLERANCE
 from tests.test_engine_versions import present
 from tests.test_parsers import LINK, MJCF, arm, causes, urdf, write

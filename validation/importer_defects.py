@@ -18,8 +18,8 @@ from mbkit.engines.imported import IMPORTERS
 from mbkit.engines.remote import process
 from mbkit.engines.remote.packages import engine
 from mbkit.errors import MbkitWarning
+from mbkit.studies.explain.terms import TERMS
 from mbkit.studies.importers import Parsed, compare_parsers
-from mbkit.studies.importers.result import TERMS
 from validation.stamp import results, stamp
 
 VERSIONS = (

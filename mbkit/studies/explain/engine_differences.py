@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import chain, combinations
 from typing import Any, Final, NamedTuple
@@ -26,14 +27,14 @@ from mbkit.studies.explain import terms
 from mbkit.studies.explain.merged_model import MergedModel, merge, number_text
 from mbkit.studies.explain.mistakes import Mistake, body_mistakes, joint_mistakes
 from mbkit.studies.explain.result import Cause, Explanation
-from mbkit.studies.explain.terms import TINY, Gap, Gaps, States, Values, evaluated, gaps, larger, model_terms
+from mbkit.studies.explain.terms import TERM, TINY, Gap, Gaps, Values, evaluated, gaps, larger, model_terms
 
 #: The field that adds to T along a rate.
 _ROTOR: Final = JointCoupling.adding_to("T")[0]
 #: Numbers of a joint that an engine may leave out, and what they are called.
 _JOINT_NUMBERS: Final = {n: n for n in ("armature", "damping", "friction")} | {"stiffness": "spring"}
 #: Quantities beside the terms of every explanation, in which known defects show.
-_FURTHER_TERMS: Final = (("C v", "coriolis_force"), ("kinetic energy", "kinetic_energy"))
+_FURTHER_TERMS: Final = ("C v", "kinetic energy")
 #: Terms mixed up: kind, sentence, and each term's parts with their factors.
 _MIXED_TERMS: Final[tuple[tuple[str, str, dict[str, dict[str, float]]], ...]] = (
     (
@@ -114,9 +115,9 @@ class _Engines:
         described = gaps(self.values[a], model_terms(self.model, self.at), self.at.v, self.joints)
         self.pinocchio_agrees = described.worst <= self.tolerance
 
-    def _terms(self, model: Model, at: States | None = None) -> Values:
+    def _terms(self, model: Model, **states: Any) -> Values:
         """Return the first engine's terms of another description or at other states; none where it refuses."""
-        at = self.at if at is None else at
+        at = replace(self.at, **states)
         try:
             return model_terms(model, at) if self.pinocchio_agrees else evaluated(type(self.a)(model), at)
         except MbkitError:
@@ -127,37 +128,35 @@ class _Engines:
 
     def defects(self) -> list[Cause]:
         """Return the known defects that show: the engine's other computation of the value is right."""
-        out = []
-        for term, quantity in _FURTHER_TERMS:
-            sides = [(dyn, *self._asked(dyn, quantity)) for dyn in (self.a, self.b)]
-            if any(values is None for _, values, _ in sides):
-                continue
-            gap = self._gap(term, *(values for _, values, _ in sides))
-            self.further_gaps.append(gap)
-            for (dyn, _, known), (_, other, _) in (sides, sides[::-1]) if gap.relative > self.tolerance else ():
-                own = self.values[dyn]
-                right: Any = 0.5 * np.einsum("ni,nij,nj->n", self.at.v, own["M"], self.at.v)
-                if term == "C v":
-                    right = own["nle"] - own["g"] if {"nle", "g"} <= own.keys() else None
-                if known and right is not None and self._gap(term, right, other).relative <= self.tolerance:
-                    says = f"{term}: {known[0].split('; returned as it is')[0]}"
-                    out.append(Cause("engine defect", dyn.engine, says, None, None, {term: gap.relative}, acts=True))
+        out, sides = [], [(dyn, *self._further_terms(dyn)) for dyn in (self.a, self.b)]
+        found = gaps(sides[0][1], sides[1][1], self.at.v, self.joints).terms
+        self.further_gaps = [gap for gap in found if gap.term != "M"]
+        for gap in (x for x in self.further_gaps if x.relative > self.tolerance):
+            for (dyn, _, known), (_, other, _) in (sides, sides[::-1]):
+                right = {"M": self.values[dyn]["M"]} | self._from_other_terms(dyn, gap.term)
+                same = [x for x in gaps(right, other, self.at.v, self.joints).terms if x.term == gap.term]
+                if gap.term in known and same and same[0].relative <= self.tolerance:
+                    says = f"{gap.term}: {known[gap.term].split('; returned as it is')[0]}"
+                    effects = {gap.term: gap.relative}
+                    out.append(Cause("engine defect", dyn.engine, says, None, None, effects, acts=True))
         return out
 
-    def _asked(self, dyn: Dynamics, quantity: str) -> tuple[Any, list[str]]:
-        """Return a quantity at all states, None where the engine refuses, and the known defects of which it warns."""
-        with warnings.catch_warnings(record=True, action="always") as caught:
-            try:
-                values = np.asarray(getattr(dyn, quantity)(self.at.q, self.at.v))
-            except MbkitError:
-                values = None
-        return values, [str(w.message) for w in caught if issubclass(w.category, KnownDefectWarning)]
+    def _further_terms(self, dyn: Dynamics) -> tuple[Values, dict[str, str]]:
+        """Return M and further terms as far as the engine has them, and the known defects of which it warns."""
+        values, known = {"M": self.values[dyn]["M"]}, dict[str, str]()
+        for term in _FURTHER_TERMS:
+            with warnings.catch_warnings(record=True, action="always") as caught, suppress(MbkitError):
+                values[term] = TERM[term].call(dyn, self.at)
+            for warning in caught:
+                if issubclass(warning.category, KnownDefectWarning):
+                    known.setdefault(term, str(warning.message))
+        return values, known
 
-    def _gap(self, term: str, a: Array, b: Array) -> Gap:
-        scale = max(float(np.abs(a).max()), float(np.abs(b).max()), TINY)
-        off = np.abs(a - b)
-        joint = self.joints[int(np.argmax(off.max(axis=0)))] if off.ndim == 2 and off.any() else ""
-        return Gap(term, float(off.max()) / scale, joint)
+    def _from_other_terms(self, dyn: Dynamics, term: str) -> Values:
+        own = self.values[dyn]
+        if term == "C v":
+            return {term: own["nle"] - own["g"]} if {"nle", "g"} <= own.keys() else {}
+        return {term: np.asarray(0.5 * np.einsum("ni,nij,nj->n", self.at.v, own["M"], self.at.v))}
 
     def causes(self) -> list[Cause]:
         """Return the first mistake after which the first engine answers as the second does."""
@@ -205,7 +204,7 @@ class _Engines:
             q[:, order] = self.at.q
         if T is not None:
             v = np.einsum("nij,nj->ni", T, v)
-        values = self._terms(self.model, States(q, v))
+        values = self._terms(self.model, q=q, v=v)
         if slip is not None and {"nle", "M"} <= values.keys():
             values["nle"] = values["nle"] + np.einsum("nij,nj->ni", values["M"], slip(v))
         if T is None:

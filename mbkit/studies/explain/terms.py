@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
@@ -27,11 +28,15 @@ from mbkit.model.elements.forces import coordinate_arguments
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.references import _OF_BODIES, _OF_JOINTS, names_in
 from mbkit.model.model import unchecked
-from mbkit.studies.compare.errors import Scales, force_errors, matrix_errors
+from mbkit.studies.compare import terms
+from mbkit.studies.compare.errors import Scales
+from mbkit.studies.compare.terms import States
 from mbkit.studies.explain.merged_model import OTHERS
 
-#: Compared terms: name in tables, quantity, arguments.
-TERMS: Final = (("M", "mass_matrix", "q"), ("g", "gravity", "q"), ("nle", "nle", "qv"), ("passive", "passive", "qv"))
+#: Terms by name, each with its quantity and its measure of errors.
+TERM: Final = {term.name: term for term in terms.TERMS}
+#: Terms of each explanation.
+TERMS: Final = ("M", "g", "nle", "passive")
 #: Least size by which a force is divided.
 TINY: Final = 1e-300
 #: Largest residual of a consistent state, relative to each row: rounded digits of a description leave as much.
@@ -39,13 +44,6 @@ _CONSISTENT: Final = 1e-6
 #: The term of two whole systems, with their constraints and all forces.
 WHOLE: Final = "accelerations"
 Values = dict[str, Array]
-
-
-class States(NamedTuple):
-    """States at which terms are compared: (N, nq) and (N, nv)."""
-
-    q: Array
-    v: Array
 
 
 @dataclass(frozen=True)
@@ -99,7 +97,8 @@ def states_of(model: Model, samples: int, seed: int) -> States:
     """Return random states of a model."""
     # Terms are those of the tree.
     tree = _with_limits_that_can_be(model).without(*CONSTRAINT_FEATURES)
-    return States(*tree.random_state(np.random.default_rng(seed), samples))
+    q, v = tree.random_state(np.random.default_rng(seed), samples)
+    return States(q, v, np.zeros_like(v), np.zeros_like(v), ("random",) * samples)
 
 
 def _with_limits_that_can_be(model: Model) -> Model:
@@ -121,12 +120,10 @@ def model_terms(model: Model, at: States) -> Values:
 def evaluated(dyn: Dynamics, at: States) -> Values:
     """Return all terms that an engine can compute."""
     out: Values = {}
-    for term, quantity, arguments in TERMS:
-        with warnings.catch_warnings(action="ignore", category=KnownDefectWarning):
-            try:
-                out[term] = getattr(dyn, quantity)(*(getattr(at, x) for x in arguments))
-            except MbkitError:
-                continue
+    with warnings.catch_warnings(action="ignore", category=KnownDefectWarning):
+        for term in TERMS:
+            with suppress(MbkitError):
+                out[term] = TERM[term].call(dyn, at)
     return out
 
 
@@ -141,7 +138,7 @@ def gaps(a: Values, b: Values, v: Array, joints: Sequence[str]) -> Gaps:
     scales = Scales(M, diagonal, inertial, nothing, np.zeros_like(diagonal), nothing, nothing)
     out = []
     for term in [t for t in a if t in b]:
-        measured = (matrix_errors if term == "M" else force_errors)(b[term] - a[term], a[term], scales)
+        measured = TERM[term].errors(b[term] - a[term], a[term], scales)
         per = measured.per_velocity
         joint = joints[int(np.argmax(per))] if per.size and per.max() > 0 else ""
         largest = float(measured.relative.max(initial=0.0))

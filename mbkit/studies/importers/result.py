@@ -10,11 +10,10 @@ from typing import ClassVar, Final
 
 from mbkit.studies.document import Bullet, Column, Document, Items, Paragraph, Section, Span, Table
 from mbkit.studies.explain.result import Explanation, cause_blocks, meanings
+from mbkit.studies.explain.terms import TERMS
 from mbkit.studies.formatting import error_text
 from mbkit.studies.results import ResultTable, columns
 
-#: The terms that each engine computes by itself, on its own model.
-TERMS: Final = ("M", "g", "nle", "passive")
 #: The name of the reference: the file as written.
 FILE: Final = "file"
 #: The version of an importer that is not there; it has refused nothing.

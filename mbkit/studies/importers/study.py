@@ -36,12 +36,13 @@ from mbkit.model.elements.forces import by_functions
 from mbkit.model.model import unchecked
 from mbkit.model.validation import listing
 from mbkit.studies import results
+from mbkit.studies.compare.terms import States
 from mbkit.studies.explain.merged_model import Tolerances
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
-from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of
+from mbkit.studies.explain.terms import TERMS, Gap, Gaps, Values, gaps, model_terms, states_of
 from mbkit.studies.importers.loops import Written, activated, between_joints, coupler_differences, loop_differences
-from mbkit.studies.importers.result import FILE, MISSING, TERMS, Parsed, ParserComparison, Stage
+from mbkit.studies.importers.result import FILE, MISSING, Parsed, ParserComparison, Stage
 from mbkit.studies.study_runs import free_of_mimic
 from mbkit.studies.worker import Worker, describe
 
@@ -206,7 +207,7 @@ def _own_terms_of(file: Model, imported: Imported, names: Mapping[str, str], at:
     if q.shape != at.q.shape or v.shape != at.v.shape:
         return {}
     q[:, q_order], v[:, v_order] = at.q, at.v
-    terms = _terms(imported, States(q, v))
+    terms = _terms(imported, replace(at, q=q, v=v))
     return {k: x[:, v_order][:, :, v_order] if x.ndim == 3 else x[:, v_order] for k, x in terms.items()}
 
 
