@@ -25,7 +25,7 @@ from mbkit.simulate.events import Hit
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.result import Ended, SolverResult
-from mbkit.simulate.solvers.friction.phases import Friction, Phase
+from mbkit.simulate.solvers.friction.phases import Friction, Phase, force_of, of_each, side_by_side
 from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.time_grid import Grid, Indices
 
@@ -51,8 +51,8 @@ def run_fixed_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics]
 
     Torque functions, and engines whose parameters are not numbers, take the members of a batch one by one.
     """
-    torque, every = problem.torque, np.arange(len(problem.q))
-    if problem.batch is not None and problem.dyn._derived and (not torque.callable or torque.feedback is not None):
+    every = np.arange(len(problem.q))
+    if side_by_side(problem):
         try:
             return _together(problem, [_Members(problem, every, solver, side_by_side=True)])
         except NumericalError:
@@ -143,13 +143,7 @@ class _Members:
 
     def forces(self, rows: Indices) -> Any:
         """Return the force in the step that follows."""
-        if self._force is not None:
-            force = self._force(int(self.k[0]))
-            return _of_each(force) if callable(force) else force[None]
-        torque = self.problem.torque
-        if torque.feedback is not None:
-            return torque.feedback
-        return torque.rows(self.k[rows, None], self.members[rows])[:, 0]
+        return force_of(self.problem.torque, self._force, self.k[rows], self.members[rows])
 
     def _of_states(
         self, rows: Indices, phase: Phase, row: Indices, step: Indices, t: Array, q: Array, v: Array
@@ -168,7 +162,7 @@ class _Members:
             return friction.margins(phase, t, q, v, forces)
         each = []
         for i, (j, when) in enumerate(zip(step.tolist(), t.tolist(), strict=True)):
-            force: Any = _of_each(self._force(first + j)) if forces is None else forces[i, None]
+            force: Any = of_each(self._force(first + j)) if forces is None else forces[i, None]
             each.append(friction.margins(phase, when, q[i : i + 1], v[i : i + 1], force))
         return np.concatenate(each)
 
@@ -406,11 +400,6 @@ def _first(over: Any, limit: Indices) -> Indices:
     # A place behind the last, as a block whose first step fails has none.
     ends = np.column_stack([over, np.full(len(over), True)])
     return np.asarray(np.minimum(ends.argmax(axis=1), limit))
-
-
-def _of_each(force: Any) -> Callable[[float, Array, Array], Array]:
-    """Return the function of states of a trajectory, (N, ...), for that of one state."""
-    return lambda t, q, v: np.array([force(t, *state) for state in zip(q, v, strict=True)])
 
 
 def with_time(dyn: Any, t: Array) -> Array:

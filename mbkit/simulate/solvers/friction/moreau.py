@@ -16,12 +16,12 @@ from mbkit.engines.base import at_time
 from mbkit.engines.elements.dry_friction import friction_forces
 from mbkit.errors import FunctionError, NumericalError
 from mbkit.model.integration_space import Space
-from mbkit.model.manifold import least_change
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.friction.phases import Friction, applied
+from mbkit.simulate.solvers.friction.phases import Friction, applied, force_of, side_by_side
 from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.solvers.vector_field import DIVERGED
+from mbkit.simulate.time_grid import Indices
 
 #: Attempts at once, and the most for one step for each velocity with friction.
 _ROUNDS: Final = 512
@@ -32,18 +32,26 @@ _UNDECIDED: Final = "which joints rest cannot be decided"
 
 def run_moreau(problem: IntegrationProblem) -> SolverResult:
     """Step one state or a batch over the grid."""
-    dyn = problem.dyn
+    dyn, torque, every = problem.dyn, problem.torque, np.arange(len(problem.q))
     record, reasons = GridRecord(problem), dict[int, str]()
-    compiled = dyn._derived and not problem.torque.callable and "jump" in dyn.model.effects
+    compiled = dyn._derived and not torque.callable and "jump" in dyn.model.effects
     compiled = compiled and getattr(dyn, "_compiles_steps", False) and not dyn.model.constrained
-    for i in range(len(problem.q)):
+    if not compiled and side_by_side(problem):
+        run = _InPython(problem, dyn, every, record, side_by_side=True)
+        steps, attempts, why = run.run()
+        if not why:
+            record.good[:], record.evaluations = steps, attempts
+            problem.bar.update(1.0)
+            return record.result()
+        # Of one state: the others have nothing to do with it.
+    for i in every.tolist():
         member = problem.member(i)
         own = dyn if member is None else dyn._of_sample(i)
-        run = (_Compiled if compiled else _InPython)(problem, own, member, record, i)
-        steps, attempts, reasons[i] = run.run()
-        record.good[i], record.error = steps, run.error
+        one = (_Compiled if compiled else _InPython)(problem, own, every[[i]], record)
+        steps, attempts, reasons[i] = one.run()
+        record.good[i], record.error = steps, one.error
         record.evaluations += attempts
-        if run.error is not None:
+        if one.error is not None:
             break
         if problem.grid.steps:
             problem.report(i)(problem.end)
@@ -51,63 +59,74 @@ def run_moreau(problem: IntegrationProblem) -> SolverResult:
 
 
 class _InPython:
-    """The steps of one trajectory, each as a problem of impulses with bounds."""
+    """The steps of one trajectory, or of several side by side, each as a problem of impulses with bounds."""
 
     #: Of a torque function that failed.
     error: FunctionError | None = None
 
     def __init__(
-        self, problem: IntegrationProblem, dyn: Dynamics, member: int | None, record: GridRecord, i: int
+        self,
+        problem: IntegrationProblem,
+        dyn: Dynamics,
+        members: Indices,
+        record: GridRecord,
+        *,
+        side_by_side: bool = False,
     ) -> None:
-        self._problem, self._dyn, self._record, self._i = problem, dyn, record, i
-        self._force = problem.torque.of_member(member)
-        self._law, self._space, self._friction = dyn._friction.law_of(dyn), Space(dyn.model), Friction(dyn)
-        self._which = np.flatnonzero(self._law.bound > 0)
-        none = np.zeros(dyn.model.nv)
+        self._problem, self._dyn, self._record, self._members = problem, dyn, record, members
+        self._force = None if side_by_side else problem.torque.of_member(problem.member(int(members[0])))
+        self._friction, self._space = Friction(dyn, side_by_side=side_by_side), Space(dyn.model)
+        none = np.zeros((len(members), dyn.model.nv))
+        self._law = dyn._friction.law_of(dyn)
+        self._rubs = np.broadcast_to(self._law.bound > 0, none.shape)
         # Without friction: neither a side nor rest.
-        self._smooth = dyn._friction.phase(dyn, none, none > 0) if len(self._which) else dyn
+        self._smooth = self._friction.given(none, none > 0, none > 0, dyn).dyn if self._rubs.any() else dyn
 
     def run(self) -> tuple[int, int, str]:
         """Return the good steps, the evaluations, and why there are not more."""
-        grid, record, i = self._problem.grid, self._record, self._i
-        q, v = self._problem.q[i], self._problem.v[i]
+        problem, record, members = self._problem, self._record, self._members
+        grid, torque = problem.grid, problem.torque
+        q, v = problem.q[members], problem.v[members]
         for k in range(grid.steps):
+            evaluations = k * len(members)
             try:
-                self._problem.sample(i, k, grid.time(k), np.concatenate([q, v]))
-                q, v = self._step(grid.time(k), grid.step(k), q, v, self._force(k))
-            except NumericalError as error:
-                return k, k, str(error)
+                torque.sample(k, grid.time(k), q, v, members)
+                force = force_of(torque, self._force, np.full(len(members), k), members)
+                q, v = self._step(grid.time(k), grid.step(k), q, v, force)
+            except (NumericalError, np.linalg.LinAlgError) as error:
+                return k, evaluations, str(error)
             except FunctionError as error:
                 self.error = error
-                return k, k, str(error)
+                return k, evaluations, str(error)
             if not (np.abs(q).max(initial=0) < _RUNAWAY and np.abs(v).max(initial=0) < _RUNAWAY):
-                return k, k, DIVERGED
+                return k, evaluations, DIVERGED
             rows = record.rows(k + 1, k + 1)
-            record.q[i, rows], record.v[i, rows] = q, v
-        return grid.steps, grid.steps, ""
+            record.q[members, rows], record.v[members, rows] = q[:, None], v[:, None]
+        return grid.steps, grid.steps * len(members), ""
 
     def _step(self, t: float, h: float, q: Array, v: Array, force: Any) -> tuple[Array, Array]:
-        dyn, which, space, bound = at_time(self._smooth, t), self._which, self._space, self._dyn.model.constrained
+        dyn, space, bound = at_time(self._smooth, t), self._space, self._dyn.model.constrained
         smooth = v + h * dyn.forward_dynamics(q, v, applied(force, t, q, v))
         inverse = self._dyn._friction.responses(dyn, q)
         if bound:
             # Rows hold velocities, not their rates: else no velocities of what rests together may be zero.
             own, M = at_time(dyn, t + h), (dyn._bare or dyn).mass_matrix(q)
             chosen = list(own._row_choice.independent)
-            J, rate = own.constraint_jacobian(q)[chosen], own.constraint_rate(q, smooth)[chosen]
-            smooth = smooth + least_change(M, J, -rate)
+            J, rate = own.constraint_jacobian(q)[:, chosen], own.constraint_rate(q, smooth)[:, chosen]
+            K = np.block([[M, J.mT], [J, np.zeros((len(q), len(chosen), len(chosen)))]])
+            right = np.concatenate([np.zeros(v.shape), -rate], axis=1)[..., None]
+            smooth = smooth + np.linalg.solve(K, right)[:, : v.shape[1], 0]
         free, holds = smooth, v != v
-        if len(which):
-            rubs = self._law.bound > 0
+        if self._rubs.any():
             slides = np.abs(self._law.force_at(v))
-            less, none, rests = h * slides[None], np.zeros((1, len(v))), v == 0
+            rests = v == 0
             # What stops or turns may be held by its stiction.
             while True:
-                most = h * np.where(rests, self._law.bound, slides)[None]
-                problem = inverse[None], smooth[None], most, less, rubs[None], none
-                (impulse,), (holds,) = friction_forces(*problem, definite=not bound)
-                free = np.where(holds, 0.0, smooth + inverse @ impulse)
-                if not (turns := rubs & ~rests & (v * free <= 0) & (slides < self._law.bound)).any():
+                most = h * np.where(rests, self._law.bound, slides)
+                given = inverse, smooth, most, h * slides, self._rubs, np.zeros(v.shape)
+                impulse, holds = friction_forces(*given, definite=not bound)
+                free = np.where(holds, 0.0, smooth + (inverse @ impulse[..., None])[..., 0])
+                if not (turns := self._rubs & ~rests & (v * free <= 0) & (slides < self._law.bound)).any():
                     break
                 rests = rests | turns
         q1 = space.retract(q, h * space.to_integrator_velocity(q, free))
@@ -119,16 +138,14 @@ class _Compiled:
 
     error: FunctionError | None = None
 
-    def __init__(
-        self, problem: IntegrationProblem, dyn: Dynamics, member: int | None, record: GridRecord, i: int
-    ) -> None:
+    def __init__(self, problem: IntegrationProblem, dyn: Dynamics, members: Indices, record: GridRecord) -> None:
         from mbkit.codegen.compiled import aligned
         from mbkit.codegen.step_loop import compiled_step_loop, width
         from mbkit.derivation.steps.moreau import MANY, PATIENCE, STATE, moreau_parts
 
-        self._problem, self._record, self._i, self._state = problem, record, i, STATE
+        self._problem, self._record, self._i, self._state = problem, record, int(members[0]), STATE
         friction, sliding = Friction(dyn), dyn._friction.sliding
-        self._force, self._space = problem.torque.of_member(member), Space(dyn.model)
+        self._force, self._space = problem.torque.of_member(problem.member(self._i)), Space(dyn.model)
         none = np.zeros(dyn.model.nv)
         own: Any = dyn._friction.phase(dyn, none, none > 0)
         names = own.model.parameters
@@ -153,7 +170,7 @@ class _Compiled:
         self._at = {name: slice(rows[f"{name}1"][0] - zero, sum(rows[f"{name}1"]) - zero) for name in STATE}
         self._count = sum(rows[name][1] for name in STATE)
         self._now = self._room[zero : zero + self._count]
-        q, w = problem.q[i], self._space.to_integrator_velocity(problem.q[i], problem.v[i])
+        q, w = problem.q[self._i], self._space.to_integrator_velocity(problem.q[self._i], problem.v[self._i])
         self._put(q=q, w=w, best=MANY, left=PATIENCE, go=1.0)
         self._friction, self._which = friction, which
         self._log = aligned(_ROUNDS * self._now.size).reshape(_ROUNDS, *self._now.shape)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -15,9 +16,10 @@ from mbkit.engines.elements.dry_friction import Mask
 from mbkit.model.changes.dry_friction import ROUNDING, STOPPED
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.simulate.constraint_projection import settled
+from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.solvers.friction.beside_rows import fades, independent, shares, slow, stopped
 from mbkit.simulate.time_grid import Indices
-from mbkit.simulate.torque import Force
+from mbkit.simulate.torque import Force, Torque
 
 _GIVES_WAY: Final = "this engine's constraints give way, and so would what rests; pinocchio and lagrangian hold both"
 BESIDE_SOFT_ROWS: Final = Path(
@@ -104,11 +106,8 @@ class Friction:
                 rate = sliding.forward_dynamics(q[rows], v[rows], tau[rows])
                 stays = resting[rows] & fades(self._directions(own, when, q[rows]), v[rows], rate)
                 still[rows] |= stays if leaving is None else stays & (leaving[rows] == 0)
-        locked = still.copy()
-        if self._bound and still.any():
-            free = self._directions(rubbed, t, q)
-            locked = np.array([independent(*one) for one in zip(_rows(free, 2), _rows(still), strict=True)])
-        return self.given(np.where(resting, -np.sign(held), signs), still, locked.reshape(still.shape), rubbed)
+        locked = self._locked(rubbed, t, q, still)
+        return self.given(np.where(resting, -np.sign(held), signs), still, locked, rubbed)
 
     def given(self, sides: Array, still: Mask, locked: Mask, rubbed: Dynamics) -> Phase:
         """Return a phase that is known."""
@@ -136,10 +135,17 @@ class Friction:
         return rests
 
     def onto_rows(self, t: float, still: Mask, start: Array, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return the consistent state beside one in which joints rest that were there at the `start`."""
-        locked = independent(self._directions(self.dyn, t, q), still)
-        rests = self._own.phase(self.dyn, np.zeros(v.shape), locked)
+        """Return the consistent states beside those in which joints rest that were there at the `start`; (N, ...)."""
+        rests = self.given(np.zeros(v.shape), still, self._locked(self.dyn, t, q, still), self.dyn).dyn
         return self.held(still, start, *settled(rests, t, q, v))
+
+    def _locked(self, dyn: Dynamics, t: float | Array, q: Array, still: Mask) -> Mask:
+        """Return which of those at rest have rotors that nothing moves, of the shape of v."""
+        if not (self._bound and still.any()):
+            return still.copy()
+        free = self._directions(dyn, t, q)
+        each = [independent(*one) for one in zip(_rows(free, 2), _rows(still), strict=True)]
+        return np.array(each).reshape(still.shape)
 
     def margins(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> Array:
         """Return how far each velocity with friction is from the end of its phase, negative beyond; (k,) or (N, k).
@@ -251,6 +257,25 @@ def _of_wrenches(dyn: Dynamics, q: Array, tau: Array) -> Array:
 def applied(force: Force, t: float | Array, q: Array, v: Array) -> Array:
     """Return the force at one state, (n,), or at several of a trajectory, (N, n)."""
     return np.asarray(force(t, q, v) if callable(force) else force)
+
+
+def side_by_side(problem: IntegrationProblem) -> bool:
+    """Return whether trajectories go side by side: of a batch whose torque is no function of one state."""
+    torque = problem.torque
+    return problem.batch is not None and problem.dyn._derived and (not torque.callable or torque.feedback is not None)
+
+
+def force_of(torque: Torque, alone: Callable[[int], Any] | None, k: Indices, members: Indices) -> Any:
+    """Return the force of members behind k steps, (m, n), or a function; `alone` gives that of one by itself."""
+    if alone is not None:
+        force = alone(int(k[0]))
+        return of_each(force) if callable(force) else force[None]
+    return torque.feedback or torque.rows(k[:, None], members)[:, 0]
+
+
+def of_each(force: Any) -> Callable[[float, Array, Array], Array]:
+    """Return the function of states of a trajectory, (N, ...), for that of one state."""
+    return lambda t, q, v: np.array([force(t, *state) for state in zip(q, v, strict=True)])
 
 
 def _rows(x: Any, axes: int = 1) -> Any:
