@@ -9,7 +9,9 @@ import os
 import re
 import warnings
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -17,8 +19,9 @@ from hypothesis import strategies as st
 from mbkit import errors
 from mbkit.errors import LoadError, MbkitError, ModelError, NonPhysicalWarning
 from mbkit.load import load, xml_reader
+from mbkit.load.added_loops import read_loops
 from mbkit.load.loader import find
-from mbkit.load.urdf_reader import read_links
+from mbkit.load.urdf_reader import Snapper, read_links
 from tests.descriptions import INERTIAL, LIMIT, links, robot, written
 from tests.descriptions import urdf_joint as joint
 
@@ -674,3 +677,47 @@ def test_a_folder_names_the_robots_near_its_top(tmp_path):
         (tmp_path / name).touch()
     with pytest.raises(LoadError, match=r"it holds a.urdf, b.xml, below.c.urdf$"):
         load(tmp_path)
+
+
+def test_limits_of_files_stand_where_they_are_said_to(tmp_path: Path) -> None:
+    """A tenth or ten times any of these limits fails here."""
+
+    def refusal(call: Any, *arguments: Any) -> str:
+        try:
+            call(*arguments)
+        except LoadError as error:
+            return str(error)
+        return ""
+
+    def of_bytes(size: int) -> Path:
+        with open(tmp_path / "big", "wb") as file:
+            file.truncate(size)
+        return tmp_path / "big"
+
+    def parsed(text: bytes) -> str:
+        return refusal(xml_reader.parse, text, "x")
+
+    nested, many, late = (
+        lambda n: b"<a>" * n + b"</a>" * n,
+        lambda n: b"<r>" + b"<a/>" * (n - 1) + b"</r>",
+        lambda n: b"<!--" + b"x" * (n - 7) + b'--><?xml version="1.0"?><r/>',
+    )
+    assert "nested more than 250 deep" in parsed(nested(251))
+    assert not parsed(nested(250))
+    assert "more than 500000 elements" in parsed(many(500_001))
+    assert not parsed(many(500_000))
+    assert "not well-formed" in parsed(late(4096))
+    assert not parsed(late(4091))
+    assert "bytes, got" in refusal(xml_reader.read, of_bytes(2**26 + 1))
+    assert "bytes, got" not in refusal(xml_reader.read, of_bytes(2**26))
+    assert "got 1000001 bytes" in refusal(read_loops, of_bytes(1_000_001))
+    assert "not a TOML file" in refusal(read_loops, of_bytes(1_000_000))
+    for attributes, faults in (({"name": "n" * 1000, "x": "9e29"}, 0), ({"name": "n" * 1001, "x": "1.1e30"}, 2)):
+        read, element = xml_reader.Reader(), xml_reader.Element("a", attributes, 1)
+        read.name(element, "name", "it")
+        read.number(element, "x", "it")
+        assert len(read.faults) == faults
+    eps = 2.0**-52
+    rounded = Snapper()(np.array([[1.0, 7 * eps], [9 * eps, 1.0]]))
+    assert rounded[0, 1] == 0
+    assert rounded[1, 0] == 9 * eps

@@ -1172,3 +1172,12 @@ def test_mjcf_flags_that_change_the_motion_are_honoured(tmp_path: Path, flags: s
     model, at = load(written(tmp_path, text, "flags.xml")), mujoco_terms(text, 1, 0)
     for engine in ("pinocchio", "lagrangian", "mujoco"):
         assert mb.dynamics(model, engine).passive(at.q, at.v) == pytest.approx(at.passive)
+
+
+@pytest.mark.parametrize("mass", [5e-15, 5e-14])
+def test_geoms_count_from_the_mass_from_which_mujoco_counts_them(mass: float, tmp_path: Path) -> None:
+    text = f"""<mujoco><worldbody><body name="a"><joint name="j"/><geom size=".1" mass="1"/>
+      <body name="b"><geom size=".1" mass="{mass}"/></body></body></worldbody></mujoco>"""
+    (tmp_path / "a.xml").write_text(text)
+    exact = mujoco.MjModel.from_xml_string(text).body("b").mass[0]
+    assert mb.load(tmp_path / "a.xml", nonphysical="warn").body("b").mass == exact == (mass if mass > 1e-14 else 0)

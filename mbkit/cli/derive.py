@@ -188,7 +188,7 @@ def _text(
     return (summary.latex(), ".tex") if form == "latex" else (summary.text(), ".txt")
 
 
-# As C.
+# Equations as C.
 
 
 @shared.command("mbkit export ur5", "mbkit export panda --quantity gravity --quantity mass_matrix --out src")

@@ -175,7 +175,7 @@ def batch_code(width: int) -> str:
     table, work, first, last = f.args
     W = _I64(width)
     kinds = {"p": _POINTER, "s": _I64}
-    # In the order of the body's arguments.
+    # They stand in the order of the body's arguments.
     held = {(name, i): b.room(kinds[name], MAX_ARRAYS) for i in (True, False) for name in kinds}
     n_in, n_out, share = (b.get(table, _I64(i), _I64) for i in range(3))
     used = b.room(_I64, 1)

@@ -26,7 +26,7 @@ T = TypeVar("T")
 _MAGIC: Final = b"mbkit machine code 1\n"
 #: The oldest entries go when the folder holds more than this, bytes.
 _MAX_CACHE_BYTES: Final = 512 * 2**20
-#: By folder what this process may write before it looks through it again, bytes.
+#: Bytes that this process may write into a folder before it looks through it again.
 _left: Final[dict[Path, int]] = {}
 #: Names of entries, and of those being written.
 _ENTRY: Final = re.compile(r"[0-9a-f]{64}|\.new-.+")

@@ -39,7 +39,7 @@ class Arithmetic:
     #: Converts a float to one number, exactly.
     number: Callable[[float], Any]
     divide: Callable[[Any, Any], Any]
-    #: By their names in C; NaN outside of the domain.
+    #: Functions by their names in C; NaN outside of the domain.
     functions: Mapping[str, Callable[..., Any]] = field(compare=False, repr=False)
 
     def sqrt(self, x: Any) -> Any:

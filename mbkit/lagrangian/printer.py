@@ -412,7 +412,7 @@ class Abbreviations:
                     counts[part.base] += 1
                     if part.exp.is_Rational and part.exp.q == 2:
                         roots.add(part.base)
-        # In the order in which they were met.
+        # They keep the order in which they were met.
         bases = [base for base, n in counts.items() if base in roots and n >= _MIN_ROOT_OCCURRENCES]
         names = {s.name for s in used}
         letter = next(name for name in ("rho", "varrho", "rho_") if name not in names)

@@ -290,7 +290,7 @@ def check_names(mujoco: Element, read: Reader) -> str:
     """Keep a fault for each unknown name that could act on the motion, and return a note about the others."""
     aside: list[str] = []
     _check(mujoco, rules(), read, aside)
-    return f"unknown to MuJoCo's schema, and ignored: {listing(aside, 6)}" if aside else ""
+    return f"unknown to MuJoCo's schema, and ignored: {listing(aside)}" if aside else ""
 
 
 def _check(element: Element, rule: Rule, read: Reader, aside: list[str], acts: bool = True) -> None:

@@ -158,4 +158,4 @@ def _mass_properties(body: Any) -> MassProperties:
 
 def name_list(names: Iterable[str]) -> str:
     """Return the first names, and how many more there are."""
-    return listing([repr(name) for name in names], 6)
+    return listing([repr(name) for name in names])

@@ -17,6 +17,7 @@ from numpy.polynomial import Polynomial
 from mbkit import spatial
 from mbkit._reproducible import product
 from mbkit.load.mjcf_attributes import HERE, Pose, has_length
+from mbkit.load.mjcf_compiled import name_list
 from mbkit.load.mjcf_couplings import bound_parts, element_label
 from mbkit.load.mjcf_reader import Scene
 from mbkit.load.urdf_reader import Snapper
@@ -214,12 +215,11 @@ class Equalities:
         for name, (joint, leaders, ratios, offset, curve) in self._couplers.items():
             b.add_coupler(name, joint, leaders, ratio=ratios, offset=offset, curve=curve)
         if self._couplers:
-            names = listing([repr(x) for x in self._couplers], 6)
-            b.note(f"equalities of joints, held exactly where MuJoCo's are soft: {names}")
+            b.note(f"equalities of joints, held exactly where MuJoCo's are soft: {name_list(self._couplers)}")
         if self._loops:
-            b.note(f"loops, held exactly where MuJoCo's are soft: {listing([repr(x) for x in self._loops], 6)}")
+            b.note(f"loops, held exactly where MuJoCo's are soft: {name_list(self._loops)}")
         if self._soft:
-            b.note(f"left out, since loops are exact: {listing(self._soft, 6)}")
+            b.note(f"left out, since loops are exact: {listing(self._soft)}")
         if self._left_out:
             b.note(f"{LEFT_OUT} of equality constraints: {'; '.join(self._left_out)}")
 

@@ -178,7 +178,7 @@ def write_out_copies(mujoco: Element, compiler: Compiler, read: Reader) -> str:
         copier.size(world)
         # Inner copies are written out first: their numbers stand before the outer ones.
         _replace_all(world, "replicate", copier.copies)
-    return f"<replicate> written out: {listing(copier.notes, 6)}" if copier.notes else ""
+    return f"<replicate> written out: {listing(copier.notes)}" if copier.notes else ""
 
 
 @dataclass
@@ -282,7 +282,7 @@ def write_out_attached(mujoco: Element, path: Path, compiler: Compiler, read: Re
         _set_main_apart(mujoco)
     for world in worlds:
         _replace_all(world, "attach", attacher.attached)
-    return f"<attach> written out: {listing(attacher.notes, 6)}" if attacher.notes else ""
+    return f"<attach> written out: {listing(attacher.notes)}" if attacher.notes else ""
 
 
 def _set_main_apart(mujoco: Element) -> None:

@@ -18,6 +18,7 @@ from xml.sax.saxutils import quoteattr
 
 from mbkit._check import shown
 from mbkit.errors import InputError, LoadError
+from mbkit.model.builder import MAX_NAME_LENGTH
 
 #: Far above any robot, far below what would exhaust memory or the stack.
 MAX_FILE_BYTES: Final = 64 * 2**20
@@ -246,7 +247,6 @@ def element_text(tag: str, attributes: Mapping[str, str], inside: str = "") -> s
 _NUMBER: Final = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 #: Larger than anything that moves, and the products of several still fit a double.
 MAX_MAGNITUDE: Final = 1e30
-_MAX_NAME_LENGTH: Final = 1000
 
 
 class Reader:
@@ -265,10 +265,10 @@ class Reader:
         value = element.attributes.get(attribute, "")
         if not value.strip():
             self.fault(f"{item}: <{element.tag}> has no {attribute}; give it one", element)
-        if len(value) > _MAX_NAME_LENGTH:
-            expected = f"expected a name of up to {_MAX_NAME_LENGTH} characters, got {len(value)}: {_short(value)}"
+        if len(value) > MAX_NAME_LENGTH:
+            expected = f"expected a name of up to {MAX_NAME_LENGTH} characters, got {len(value)}: {_short(value)}"
             self.fault(f"{item}: {element.tag} {attribute}: {expected}", element)
-        return value[:_MAX_NAME_LENGTH]
+        return value[:MAX_NAME_LENGTH]
 
     def numbers(
         self,

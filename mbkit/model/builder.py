@@ -28,7 +28,7 @@ from mbkit.model.validation import body_faults, fault_sentences, static_bodies, 
 
 # The squares of sums of such lengths still fit a double.
 MAX_LENGTH: Final = 1e150
-_MAX_NAME_LENGTH: Final = 1000
+MAX_NAME_LENGTH: Final = 1000
 #: Types of a vector, and of one number or several, in the builder's methods.
 _Vector = ArrayLike | Sequence[Number]
 _Numbers = ArrayLike | Sequence[Number] | Number
@@ -40,7 +40,7 @@ class ArgumentReader:
     def __init__(self) -> None:
         self.faults: list[str] = []
 
-    def name(self, what: str, value: Any, longest: int = _MAX_NAME_LENGTH) -> str:
+    def name(self, what: str, value: Any, longest: int = MAX_NAME_LENGTH) -> str:
         """Return a name: text that UTF-8 can hold, short enough for a message."""
         if not isinstance(value, str):
             self.faults.append(f"{what}: expected a name, got {shown(value)}")

@@ -43,7 +43,7 @@ def repeated_names(what: str, names: Iterable[str]) -> list[str]:
     return [f"{what} {n!r}: declared {k} times; names must differ" for n, k in Counter(names).items() if k > 1]
 
 
-def listing(texts: Sequence[str], most: int = 20) -> str:
+def listing(texts: Sequence[str], most: int = 6) -> str:
     """Return the first texts, and how many more there are."""
     return ", ".join(texts[:most]) + (f" and {len(texts) - most} more" if len(texts) > most else "")
 
@@ -343,7 +343,7 @@ def fault_sentences(reasons: Iterable[tuple[str, str]], parts: Mapping[str, Sequ
             continue
         plural = "links" if all(what == "link" for what, *_ in members) else "bodies"
         names = [f"{name!r} ({detail})" if detail else repr(name) for _, name, _, detail in members]
-        out.append(f"{len(members)} {plural}: {sentence}: {listing(names)}")
+        out.append(f"{len(members)} {plural}: {sentence}: {listing(names, 20)}")
     return out
 
 
@@ -412,7 +412,7 @@ def scale_doubts(model: Description) -> list[str]:
         (f"joints that move less than {_MIN_MASS_OR_MOMENT:g} kg or kg m², which MuJoCo takes for zero", small),
         ("joints whose inertia is lost beside m L² of the whole mechanism", far),
     )
-    out = [f"{what}: {listing(joints)}" for what, joints in causes if joints]
+    out = [f"{what}: {listing(joints, 20)}" for what, joints in causes if joints]
     if values[0] * _MAX_SIZE_RATIO * 10 < values[-1]:
         out.append(f"M is nearly singular (eigenvalues {values[0]:.1e} to {values[-1]:.1e}, scaled to a unit diagonal)")
     return out

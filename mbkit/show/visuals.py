@@ -292,7 +292,7 @@ def _geoms(model: _Bodies, compiled: Any, kind: str) -> Iterator[Shape]:
             yield Shape(*placed, shape, tuple(float(s) for s in geom.size[: SIZES[shape]]), color=color)
 
 
-#: By the numbers of mjtGeom.
+#: Kinds of geoms by their numbers in mjtGeom.
 _GEOMS: Final = ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
 
 

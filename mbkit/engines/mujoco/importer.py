@@ -38,8 +38,6 @@ _TYPES, _KINDS = tuple(KINDS), tuple(KINDS.values())
 #: Flags that change no smooth term, and may take long or leave a part of the tree out.
 _OFF: Final = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT)
 _ASLEEP: Final = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-#: Names that a note lists.
-_MAX_NAMES: Final = 6
 #: Takes something out of a compiled model.
 _Removal = Callable[[Any], None]
 _OF_TENDON: Final = ("stiffness", "stiffnesspoly", "damping", "dampingpoly", INERTIA)
@@ -143,7 +141,7 @@ def _constraints(m: Any) -> list[str]:
     kinds, out = by_key((kind, _called(m.eq(i), i)) for i, kind in enumerate(types)), []
     for kind, names in kinds.items():
         what = "mimic joints are soft equality constraints" if kind == "joint" else f"{kind} constraints are soft"
-        out.append(f"{what} ({listing(names, _MAX_NAMES)}), in none of the terms")
+        out.append(f"{what} ({listing(names)}), in none of the terms")
     return out
 
 

@@ -79,7 +79,7 @@ def conserved_momenta(system: EnergyForm) -> dict[sp.Symbol, sp.Expr]:
 def energy_function(system: EnergyForm) -> sp.Expr:
     """Return h = vᵀ ∂L/∂v - L = T2 - T0 + V."""
     if is_energy(system):
-        # As its author wrote it.
+        # It stays as its author wrote it.
         return system.T + system.V
     k = system.kinetic
     return k.T2 - k.T0 + system.V

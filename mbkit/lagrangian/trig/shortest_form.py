@@ -248,7 +248,7 @@ def _irreducible(poly: Poly) -> bool:
     """Return whether a sum surely has no factors: those of Q a + R are shared by Q and R, tested at random numbers."""
     atoms = list(dict.fromkeys(a for powers in poly for a, _ in powers))
     rows = [tuple(dict(powers).get(a, 0) for a in atoms) for powers in poly]
-    # Without what all terms share, which is no factor that is looked for.
+    # Factors that all terms share are not looked for.
     least = [min(es) for es in zip(*rows, strict=True)]
     rows = [tuple(e - f for e, f in zip(row, least, strict=True)) for row in rows]
     scale = lcm(*(v.denominator for v in poly.values()))

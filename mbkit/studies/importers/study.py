@@ -131,7 +131,7 @@ def compared(engine: str, imported: Imported, file: Model, loops: Written, asked
         apart = stages(file, loops, imported, why, **asked)
     own, idle = own_terms(engine, imported, **asked)
     if unmatched:
-        notes = [f"compared by what they do to passive forces alone: {listing([*map(str, unmatched)], 6)}"]
+        notes = [f"compared by what they do to passive forces alone: {listing([*map(str, unmatched)])}"]
     terms = [s for s in apart if s.name in TERMS]
     found, same = tuple(Gap(s.name, s.worst, s.where) for s in terms), all(s.same is True for s in terms)
     known, notes = all(math.isfinite(s.worst) for s in terms), [*why.notes, *imported.notes, *idle, *notes]

@@ -251,7 +251,7 @@ def solid_body(at: Judged) -> Iterator[LintFinding]:
     ratios = {body.name: float(np.trace(own)) for body, own, _, _ in _solids(at)}
     if off := {k: x for k, x in ratios.items() if max(x, 1 / x) > SOLID_INERTIA_RATIO}:
         first, *others = sorted(off, key=lambda k: -abs(np.log(off[k])))
-        shown = listing([f"{k} {off[k]:.2g}" for k in (first, *others)], 6)
+        shown = listing([f"{k} {off[k]:.2g}" for k in (first, *others)])
         says, expected = (
             f"inertia over a solid body's: {shown}",
             f"{1 / SOLID_INERTIA_RATIO:g} to {SOLID_INERTIA_RATIO:g} for what is not hollow",
@@ -302,7 +302,7 @@ def copied_inertia(at: Judged) -> Iterator[LintFinding]:
     for group in by_key((tuple(f"{x + 0.0:.9g}" for x in b.inertia[_UPPER]), b) for b in bodies).values():
         if len(group) >= MIN_COPIES and any(_differ(a, b, at) for a, b in combinations(group, 2)):
             names = [body.name for body in group]
-            says = f"the same inertia on {len(group)} links of different shape or mass: {listing(names, 6)}"
+            says = f"the same inertia on {len(group)} links of different shape or mass: {listing(names)}"
             expected = "an inertia for each shape"
             yield LintFinding(names[0], "copied inertia", len(group), expected, LIKELY, says, tuple(names[1:]))
 
