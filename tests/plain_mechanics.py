@@ -4,14 +4,13 @@ Each part says how it is declared to mbkit, and apart from that its energy, forc
 Derivatives are complex steps, exact to rounding; mbkit computes nothing here.
 """
 
-# ruff: noqa: ARG001, ARG005  # all parts and all paths are called alike
+# ruff: noqa: ARG001  # all parts and all paths are called alike
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 import mbkit as mb
@@ -310,171 +309,6 @@ class Case:
 # Parts
 
 
-def _spring(case: Case, rng: np.random.Generator) -> Part:
-    i, k, rest = int(rng.integers(case.n)), rng.uniform(1, 9), 0.3
-    return Part(
-        "joint.spring", ("spring", "stiffness"), joint={i: {"stiffness": k, "rest": rest}},
-        energy=lambda c, q: k / 2 * (q[i] - rest) ** 2,
-    )  # fmt: skip
-
-
-def _damping(case: Case, rng: np.random.Generator) -> Part:
-    i, d = int(rng.integers(case.n)), rng.uniform(0.2, 1)
-    return Part(
-        "joint.damping", ("damping",), joint={i: {"damping": d}}, force=lambda c, t, q, v: -d * v[i] * np.eye(c.n)[i]
-    )
-
-
-def _armature(case: Case, rng: np.random.Generator) -> Part:
-    i, a = int(rng.integers(case.n)), rng.uniform(0.2, 1)
-    return Part(
-        "joint.armature", ("armature",), joint={i: {"armature": a}},
-        inertia=lambda c, q: a * np.outer(np.eye(c.n)[i], np.eye(c.n)[i]),
-    )  # fmt: skip
-
-
-def _friction(case: Case, rng: np.random.Generator) -> Part:
-    i, f = int(rng.integers(case.n)), rng.uniform(0.2, 1)
-    return Part(
-        "joint.friction", ("friction",), joint={i: {"friction": f}},
-        force=lambda c, t, q, v: -f * np.sign(v[i]) * np.eye(c.n)[i],
-    )  # fmt: skip
-
-
-def _stiction(case: Case, rng: np.random.Generator) -> Part:
-    i, f = int(rng.integers(case.n)), rng.uniform(0.2, 1)
-    s, w = 1.7 * f, rng.uniform(0.5, 2)
-
-    def force(c: Case, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        return -(f + (s - f) * np.exp(-((v[i] / w) ** 2))) * np.sign(v[i]) * np.eye(c.n)[i]
-
-    numbers = {"friction": f, "stiction": s, "stribeck_velocity": w}
-    return Part("joint.stiction", ("stiction", "friction", "Stribeck"), joint={i: numbers}, force=force)
-
-
-def _force_of_time(case: Case, rng: np.random.Generator) -> Part:
-    i, a, w = int(rng.integers(case.n)), rng.uniform(1, 3), rng.uniform(1, 3)
-
-    def declare(b: mb.ModelBuilder) -> None:
-        b.add_joint_force("push", f"j{i}", lambda t, q, v: a * ca.cos(w * t) - 0.3 * q * v, potential=lambda q: q**4)
-
-    return Part(
-        "force.time", ("push", "force"), declare,
-        energy=lambda c, q: q[i] ** 4,
-        force=lambda c, t, q, v: (a * np.cos(w * t) - 0.3 * q[i] * v[i]) * np.eye(c.n)[i],
-    )  # fmt: skip
-
-
-def _frame_force(case: Case, rng: np.random.Generator) -> Part:
-    k, w = len(case.kinds) - 1, rng.uniform(1, 3)
-    F, T = rng.standard_normal((2, 3))
-
-    def declare(b: mb.ModelBuilder) -> None:
-        b.add_force("thrust", "tip", force=[F[0] * ca.sin(w * ca.SX.sym("t")), F[1], F[2]], moment=list(T))
-
-    def force(c: Case, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        R, _ = c.pose(f"b{k}", q)
-        local = np.array([F[0] * np.sin(w * t), F[1], F[2]])
-        return c.moving(k, TIP, q).T @ R @ local + c.turning(k, q).T @ R @ T
-
-    return Part("force.frame", ("thrust", "force"), declare, force=force)
-
-
-def _point_spring(case: Case, rng: np.random.Generator) -> Part:
-    last, k, d = f"b{len(case.kinds) - 1}", rng.uniform(5, 20), rng.uniform(0.2, 1)
-    a, rest = np.array([1.0, 2.0, 3.0]), 0.5
-
-    def length(c: Case, q: np.ndarray) -> Any:
-        return norm(c.point(last, (0.1, 0, 0.2), q) - a)
-
-    def force(c: Case, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        J = derivative(lambda x: length(c, x), q)
-        return -d * (J @ v) * J
-
-    def declare(b: mb.ModelBuilder) -> None:
-        ends = {"body_a": "world", "point_a": a, "body_b": last, "point_b": (0.1, 0, 0.2)}
-        b.add_spring("cord", **ends, stiffness=k, rest_length=rest, damping=d)
-
-    return Part(
-        "spring.point", ("cord", "spring"), declare,
-        energy=lambda c, q: k / 2 * (length(c, q) - rest) ** 2, force=force,
-    )  # fmt: skip
-
-
-def _coupling(case: Case, rng: np.random.Generator) -> Part:
-    row = np.zeros(case.n)
-    i, j = rng.permutation(case.n)[:2]
-    row[[i, j]] = rng.uniform(0.3, 2, 2)
-    k, d, a, rest = rng.uniform(1, 9), rng.uniform(0.2, 1), rng.uniform(0.2, 1), 0.2
-
-    def declare(b: mb.ModelBuilder) -> None:
-        factors = {f"j{i}": row[i], f"j{j}": row[j]}
-        b.add_coupling("tendon", factors, stiffness=k, rest_length=rest, damping=d, armature=a)
-
-    return Part(
-        "coupling", ("tendon", "coupling"), declare,
-        energy=lambda c, q: k / 2 * (row @ q - rest) ** 2,
-        inertia=lambda c, q: a * np.outer(row, row),
-        force=lambda c, t, q, v: -d * (row @ v) * row,
-    )  # fmt: skip
-
-
-def _compensation(case: Case, rng: np.random.Generator) -> Part:
-    k, part = int(rng.integers(len(case.kinds))), rng.uniform(0.3, 1.2)
-    return Part(
-        "gravcomp", ("gravity compensation", "weight"),
-        lambda b: b.add_gravity_compensation(f"b{k}", part),
-        energy=lambda c, q: part * c.mass[k] * GRAVITY @ c.point(f"b{k}", c.com[k], q),
-    )  # fmt: skip
-
-
-def _bushing(case: Case, rng: np.random.Generator) -> Part:
-    last, k, d = f"b{len(case.kinds) - 1}", rng.uniform(1, 9, 6), rng.uniform(0.1, 1, 6)
-    R_0, p_0 = case.pose(last, case.q)
-    R_A, p_A = R_0 @ rotation(np.array([0.6, 0.0, 0.8]), 0.7), p_0 + np.array([0.1, -0.2, 0.1])
-
-    def displaced(c: Case, q: np.ndarray) -> np.ndarray:
-        R, p = c.pose(last, q)
-        B = R_A.T @ R
-        angle = np.arccos((np.trace(B) - 1) / 2)
-        turn = np.array([B[2, 1] - B[1, 2], B[0, 2] - B[2, 0], B[1, 0] - B[0, 1]])
-        return np.concatenate([R_A.T @ (p - p_A), turn * angle / (2 * np.sin(angle))])
-
-    def force(c: Case, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        J = derivative(lambda x: displaced(c, x), q)
-        return -J.T @ (d * (J @ v))
-
-    def declare(b: mb.ModelBuilder) -> None:
-        a = {"body_a": "world", "rotation_a": R_A, "translation_a": p_A}
-        b.add_bushing("rubber", **a, body_b=last, stiffness=k, damping=d)
-
-    return Part(
-        "bushing", ("rubber", "bushing"), declare,
-        energy=lambda c, q: np.sum(k * displaced(c, q) ** 2) / 2, force=force,
-    )  # fmt: skip
-
-
-def _coupler(case: Case, rng: np.random.Generator) -> Part:
-    i, j = map(int, rng.permutation(case.n)[:2])
-    ratio = rng.uniform(0.4, 1.5)
-    offset = case.q[i] - ratio * case.q[j]
-    return Part(
-        "coupler", ("gear", "coupler"),
-        lambda b: b.add_coupler("gear", f"j{i}", f"j{j}", ratio=ratio, offset=offset),
-        rows=lambda c, t, q: [q[i] - ratio * q[j] - offset],
-    )  # fmt: skip
-
-
-def _prescribed(case: Case, rng: np.random.Generator) -> Part:
-    i, w, a = 0, rng.uniform(1, 3), rng.uniform(0.2, 0.6)
-    start = case.q[i] - a * np.sin(w * case.t)
-    return Part(
-        "prescribed", ("prescribed", "moved in time", "'j0'"),
-        lambda b: b.prescribe(f"j{i}", offset=start, amplitude=a, frequency=w),
-        rows=lambda c, t, q: [q[i] - start - a * np.sin(w * t)],
-    )  # fmt: skip
-
-
 def loop_part(
     case: Case, rng: np.random.Generator, kind: str, name: str = "lp", body: str = "", link: int = -1
 ) -> Part:
@@ -516,55 +350,3 @@ def loop_part(
 
 
 LOOPS = {"point": 3, "distance": 1, "revolute": 5, "universal": 4, "cylindrical": 4, "prismatic": 5, "frame": 6}
-PARTS = (
-    _spring, _damping, _armature, _friction, _stiction, _force_of_time, _frame_force, _point_spring, _coupling,
-    _compensation, _bushing, _coupler, _prescribed,
-)  # fmt: skip
-
-
-def random_case(seed: int) -> Case:
-    """Return a chain with two to five kinds of parts; one case in four has a loop, one in six a mimic joint."""
-    rng = np.random.default_rng([seed, 51])
-    kind = str(rng.choice([*LOOPS])) if rng.random() < 0.25 else ""
-    n = LOOPS[kind] + 1 if kind else int(rng.integers(2, 5))
-    mimics = not kind and n > 2 and rng.random() < 0.3
-    kinds = [str(x) for x in rng.choice(["revolute", "revolute", "prismatic"], n)]
-    if kind:
-        # Three hinges and three slides at most move a body in all six ways.
-        kinds = list(rng.permutation((["revolute", "prismatic"] * 4)[:n]))
-        kinds = [str(x) for x in kinds]
-    axes = rng.standard_normal((n, 3))
-    axes /= np.linalg.norm(axes, axis=1)[:, None]
-    I = []
-    for _ in range(n):
-        d, R = rng.uniform(0.05, 0.4, 3), _turn(rng)
-        I.append(R @ np.diag([d[0] + d[1], d[1] + d[2], d[2] + d[0]]) @ R.T)
-    G, c = np.eye(n), np.zeros(n)
-    if mimics:
-        G = np.vstack([np.eye(n - 1), 0.7 * np.eye(n - 1)[0]])
-        c[-1] = 0.2
-    m = G.shape[1]
-    q, v = rng.uniform(-1, 1, m), rng.choice([-1.0, 1.0], m) * rng.uniform(0.3, 1, m)
-    case = Case(
-        seed, kinds, axes, [_turn(rng) for _ in range(n)], rng.uniform(-0.5, 0.5, (n, 3)), rng.uniform(0.5, 2, n),
-        rng.uniform(-0.3, 0.3, (n, 3)), I, [], q, v, rng.standard_normal(m), 0.37, G, c,
-    )  # fmt: skip
-    if mimics:
-        case.parts.append(Part("mimic", ("mimic",), joint={n - 1: {"mimic": ("j0", 0.7, 0.2)}}))
-    if kind:
-        case.parts.append(loop_part(case, rng, kind))
-    wanted = int(rng.integers(2, 6)) - len(case.parts)
-    for k in rng.permutation(len(PARTS)):
-        if wanted <= 0:
-            break
-        binds = PARTS[k] in (_coupler, _prescribed)
-        rows = sum(len(p.rows(case, case.t, case.q)) for p in case.parts if p.rows)
-        # At least one velocity stays free. Friction stands once.
-        if binds and (kind or rows + 2 > m):
-            continue
-        if PARTS[k] in (_friction, _stiction) and any("friction" in p.kind or "stiction" in p.kind for p in case.parts):
-            continue
-        case.parts.append(PARTS[k](case, rng))
-        wanted -= 1
-    case.v = case.allowed(case.t, case.q, case.v)
-    return case

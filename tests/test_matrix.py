@@ -1,19 +1,15 @@
 """Every kind of part on every path: right to rounding, or refused by the part's name.
 
-Random models have two to five kinds; their truth is `tests.plain_mechanics`, NumPy alone. A path that forgets a part
-gives another acceleration, motion or energy, and fails here; a refusal has to name one of the parts that the model has.
-
-Then each kind alone goes through each gate. A kind without an example and a path without a check fail the suite.
+Each kind alone goes through each gate and along each path; models of several kinds are those of `tests.test_pairs`. A path
+that forgets a part gives another acceleration, motion or energy, and fails here; a refusal has to name a part. A kind
+without an example and a path without a check fail the suite.
 """
 
 # ruff: noqa: ARG001, ARG005  # all parts and all paths are called alike
 from __future__ import annotations
 
-import ctypes
 import json
 import shutil
-import subprocess
-import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -28,9 +24,7 @@ import pytest
 import scipy.linalg
 
 import mbkit as mb
-from mbkit.codegen.c_source import export_c
-from mbkit.errors import InputError, MbkitWarning, UnknownNameError, UnsupportedError
-from mbkit.lagrangian import from_model, program
+from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.model.elements.kinds import PART_KINDS, Kind, kind, register_kind
 from mbkit.model.elements.paths import PATHS as GATES
 from mbkit.model.elements.paths import Path as Gate
@@ -39,229 +33,17 @@ from tests import kind_examples, kind_mutations, path_checks
 from tests.kind_examples import EXAMPLES, TYPES
 from tests.kind_mutations import seen
 from tests.kind_studies import COLUMNS, ROWS, cell, registered
-from tests.plain_mechanics import TIP, Case, random_case
 from tests.test_engine_versions import present
 from validation.matrix import takes
 
 pytestmark = pytest.mark.usefixtures("own_environments")
-ENGINES = ("lagrangian", "pinocchio", "mujoco", "drake", "oracle")
 #: Sums of a few hundred rounded terms, and second differences of the reference's rows.
 CLOSE = 1e-9
-CASES = range(200)
-
-
-def dynamics(case: Case, model: mb.Model | None = None, engine: str = "lagrangian") -> mb.Dynamics:
-    model = case.model() if model is None else model
-    options = {"compile": False} if engine == "lagrangian" else {}
-    dyn = mb.dynamics(model, engine, **options)
-    return dyn.at(**{model.time_parameter: case.t}) if model.time_parameter else dyn
 
 
 def assert_close(got: np.ndarray, wanted: np.ndarray, close: float = CLOSE) -> None:
     assert np.shape(got) == np.shape(wanted)
     assert np.abs(got - wanted).max() < close * max(1.0, np.abs(wanted).max())
-
-
-def expected(case: Case) -> np.ndarray:
-    return case.acceleration(case.t, case.q, case.v, case.tau)
-
-
-# Paths: each returns what is compared, or raises UnsupportedError.
-
-
-def on_engine(engine: str) -> Callable[[Case, Path], None]:
-    def check(case: Case, folder: Path) -> None:
-        dyn = dynamics(case, engine=engine)
-        a = dyn.forward_dynamics(case.q, case.v, case.tau)
-        if dyn._soft_constraints and any(p.rows for p in case.parts):
-            # MuJoCo's constraints are soft; its law, which its solver reaches, becomes the rigid one.
-            law = dyn.constraint_law(case.q, case.v, case.tau)
-            assert_close(a, law.acceleration)
-            a = law.rigid
-        assert_close(a, expected(case))
-        one = dyn.potential_energy(case.q) - dyn.potential_energy(0 * case.q)
-        assert_close(np.array(one), np.array(case.potential(case.q) - case.potential(0 * case.q)))
-
-    return check
-
-
-def by_from_model(case: Case, folder: Path) -> None:
-    driven = any(p.kind == "prescribed" for p in case.parts)
-    lag = from_model(case.model(), drives=driven)
-    dyn = lag.dynamics(options={"compile": False})
-    if dyn.model.time_parameter:
-        dyn = dyn.at(**{dyn.model.time_parameter: case.t})
-    assert_close(dyn.forward_dynamics(case.q, case.v, case.tau), expected(case))
-
-
-def by_program(case: Case, folder: Path) -> None:
-    names: dict = {}
-    text = program(case.model(), "forward_dynamics")
-    exec(text.python(), names)
-    more = [np.array([case.t])] if len(text.inputs) > 3 else []
-    assert_close(np.asarray(names["forward_dynamics"](case.q, case.v, case.tau, *more)), expected(case))
-
-
-def by_casadi(case: Case, folder: Path) -> None:
-    function = mb.dynamics(case.model(), "lagrangian").function("forward_dynamics")
-    more = [case.t] if function.n_in() > 3 else []
-    assert_close(function(case.q, case.v, case.tau, *more).full()[:, 0], expected(case))
-
-
-def by_c(case: Case, folder: Path) -> None:
-    made = export_c(case.model(), ["forward_dynamics"], name="case")
-    _, source = made.write(folder)
-    library = folder / "library.so"
-    subprocess.run(["cc", "-O0", "-shared", "-fPIC", str(source), "-o", str(library), "-lm"], check=True)
-    described = made.functions[0]
-    arguments = [case.q, case.v, case.tau, np.array([case.t])][: len(described.inputs)]
-    out = np.full(case.n, np.nan)
-    call = getattr(ctypes.CDLL(str(library)), described.name)
-    call.restype = None
-    call(*(np.ascontiguousarray(x).ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for x in (*arguments, out)))
-    assert_close(out, expected(case))
-
-
-def by_file(kind: str) -> Callable[[Case, Path], None]:
-    def check(case: Case, folder: Path) -> None:
-        model = case.model()
-        path = mb.convert(model, kind).write(folder / f"case.{'xml' if kind == 'mjcf' else 'urdf'}")
-        back = mb.load(path, gravity=model.gravity) if kind == "urdf" else mb.load(path)
-        # An MJCF keeps a mimic joint, as one that a coupler holds.
-        whole = len(case.G) if len(back.joint_names) > case.n else case.n
-        q, v, a = case.q, case.v, expected(case)
-        tau = np.concatenate([case.tau, np.zeros(whole - case.n)])
-        if whole > case.n:
-            q, v, a = case.G @ q + case.c, case.G @ v, case.G @ a
-        order = [int(name[1:]) for name in back.joint_names]
-        assert sorted(order) == list(range(whole))
-        assert_close(dynamics(case, back).forward_dynamics(q[order], v[order], tau[order]), a[order])
-
-    return check
-
-
-def by_explain(case: Case, folder: Path) -> None:
-    """The whole model beside the one without a part: the difference is seen, and explained by what differs."""
-    whole = case.model()
-    for part in case.parts:
-        without = case.model(kept=lambda x, part=part: x is not part)
-        out = mb.explain(whole, without)
-        assert not out.agree, f"explain does not see {part.kind}: {out.verdict}"
-        assert out.acting, f"explain has no cause for {part.kind}: {out.verdict}"
-        text = " ".join(f"{c.kind} {c.says}" for c in out.acting).lower()
-        assert any(w.lower() in text for w in part.words), f"{part.kind}: {text}"
-
-
-def by_lock(case: Case, folder: Path) -> None:
-    """A locked joint is one whose velocity and acceleration stay zero; energies are the whole model's."""
-    model = case.model()
-    k = case.n - 1
-    name = f"j{k}"
-    try:
-        locked = model.lock({name: case.q[k]})
-    except InputError as refusal:
-        # What is moved in time cannot stand still.
-        raise UnsupportedError(str(refusal)) from refusal
-    kept = [i for i in range(case.n) if f"j{i}" in locked.joint_names]
-    v = case.v * (np.arange(case.n) != k)
-    dyn = dynamics(case, locked)
-    # Where constraints bind the joint, what is left of them may hold more than this joint.
-    if not any(p.rows for p in case.parts):
-        wanted = case.acceleration(case.t, case.q, v, case.tau, hold=(k,))
-        assert_close(dyn.forward_dynamics(case.q[kept], v[kept], case.tau[kept]), wanted[kept])
-        whole = dynamics(case, model)
-        assert_close(np.array(dyn.potential_energy(case.q[kept])), np.array(whole.potential_energy(case.q)))
-        assert_close(np.array(dyn.kinetic_energy(case.q[kept], v[kept])), np.array(whole.kinetic_energy(case.q, v)))
-
-
-def by_join(case: Case, folder: Path) -> None:
-    """Beside a pendulum that nothing touches, the model moves as alone."""
-    b = mb.ModelBuilder("clock", gravity=case.model().gravity)
-    b.add_body("bob", mass=1.0, com=(0, 0, -1), inertia=(0.1, 0.1, 0.1))
-    b.add_joint("pivot", "revolute", parent="world", child="bob", axis=(0, 1, 0))
-    for model in (mb.join(b.build(), case.model(), at="world"), mb.join(case.model(), b.build(), at="world")):
-        where = [model.joint_names.index(n) for n in case.model().joint_names]
-        q, v, tau = (np.zeros(model.nv) for _ in range(3))
-        q[where], v[where], tau[where] = case.q, case.v, case.tau
-        assert_close(dynamics(case, model).forward_dynamics(q, v, tau)[where], expected(case))
-
-
-def by_run(case: Case, folder: Path) -> None:
-    """A controller that is sampled beside a wrench, against the same steps in NumPy; energy and work balance."""
-    w, dt, hold, duration = np.array([0.5, -0.3, 0.2, 0.1, 0.2, -0.1]), 1e-3, 4e-3, 0.012
-    gain, last, each = 0.5 * np.arange(1, case.n + 1), len(case.kinds) - 1, round(hold / dt)
-
-    def torque(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        return case.tau - gain * v
-
-    def of_wrench(q: np.ndarray) -> np.ndarray:
-        return case.moving(last, TIP, q).T @ w[:3] + case.turning(last, q).T @ w[3:]
-
-    # Step by step, so that no stage looks into the next sample.
-    q, v, held = case.q, case.v, case.tau
-    for k in range(round(duration / dt)):
-        held = torque(0.0, q, v) if k % each == 0 else held
-        here = replace(case, t=case.t + k * dt, q=q, v=v)
-        q, v = here.rk4(dt, dt, lambda t, q, v, held=held: held + of_wrench(q))
-    dyn = dynamics(case)
-    run = mb.simulate(
-        dyn, case.q, case.v, duration, "rk4", dt=dt, t0=case.t, torque=torque, hold=hold,
-        wrenches={"tip": w}, wrench_axes="local_world_aligned",
-    )  # fmt: skip
-    assert run.stats.ended == "finished"
-    # Steps are pulled back onto constraints; the plain ones drift by the error of a step.
-    close = 1e-8 if any(p.rows for p in case.parts) else 1e-10
-    assert_close(run.q[-1], q, close)
-    assert_close(run.v[-1], v, close)
-    applied = run.wrenches()["tip"]
-    assert_close(applied, np.tile(w, (len(applied), 1)))
-    scale = max(1.0, np.abs(run.energy()).max(), np.abs(run.work()).max())
-    assert np.abs(run.power_balance()).max() < 1e-7 * scale
-
-
-PATHS: dict[str, Callable[[Case, Path], None]] = {
-    **{engine: on_engine(engine) for engine in ENGINES},
-    "from_model": by_from_model,
-    "program": by_program,
-    "casadi": by_casadi,
-    "c": by_c,
-    "urdf": by_file("urdf"),
-    "mjcf": by_file("mjcf"),
-    "explain": by_explain,
-    "lock": by_lock,
-    "join": by_join,
-    "run": by_run,
-}
-
-
-@pytest.mark.thorough(every=20)
-@pytest.mark.parametrize("path", PATHS)
-@pytest.mark.parametrize("seed", CASES)
-def test_a_path_is_right_or_refuses_a_part_by_name(seed: int, path: str, tmp_path: Path) -> None:
-    if path == "c" and shutil.which("cc") is None:
-        pytest.skip("no C compiler on PATH")
-    case = random_case(seed)
-    with warnings.catch_warnings(action="ignore", category=MbkitWarning):
-        refusal = ""
-        try:
-            PATHS[path](case, tmp_path)
-        except UnsupportedError as error:
-            refusal = str(error)
-    if path in GATES:
-        # Neither by accident nor in silence.
-        model = case.model()
-        # Drake's plant has the terms of a tree with loops, and no acceleration that holds them.
-        assert bool(refusal) == bool(GATES[path].refuses(model) or (path == "drake" and model.constrained))
-    # A model may be too large to be written out, whatever its parts.
-    words = (*case.words, "too many terms")
-    assert not refusal or any(word.lower() in refusal.lower() for word in words), refusal
-
-
-@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
-def test_a_hinge_that_a_loop_holds_may_have_stiction(engine: str) -> None:
-    """It rests whatever its friction is; its response to forces is rounding, of either sign."""
-    case = random_case(203)
-    assert_close(dynamics(case, engine=engine).forward_dynamics(case.q, case.v, case.tau), expected(case))
 
 
 # Each kind alone
