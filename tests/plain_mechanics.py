@@ -288,23 +288,6 @@ class Case:
         b = np.concatenate([-np.asarray(drift) / _STEP, speeds])
         return v - np.linalg.pinv(J) @ (J @ v - b) if len(J) else v
 
-    def rk4(self, duration: float, dt: float, tau: Callable[..., np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the state after steps of the classical method, with the force as a function of (t, q, v)."""
-        t, q, v = self.t, self.q, self.v
-
-        def f(s: float, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            return v, self.acceleration(s, q, v, tau(s, q, v))
-
-        for _ in range(round(duration / dt)):
-            a = f(t, q, v)
-            b = f(t + dt / 2, q + dt / 2 * a[0], v + dt / 2 * a[1])
-            c = f(t + dt / 2, q + dt / 2 * b[0], v + dt / 2 * b[1])
-            d = f(t + dt, q + dt * c[0], v + dt * c[1])
-            q = q + dt / 6 * (a[0] + 2 * b[0] + 2 * c[0] + d[0])
-            v = v + dt / 6 * (a[1] + 2 * b[1] + 2 * c[1] + d[1])
-            t += dt
-        return q, v
-
 
 # Parts
 

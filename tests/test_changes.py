@@ -271,23 +271,6 @@ def test_a_locked_model_has_the_rows_and_columns_that_are_left(seed, data):
     assert a.shape == v.shape
 
 
-@pytest.mark.thorough("talos", "g1")
-@pytest.mark.parametrize("name", ["ur5", "anymal", "talos", "g1", "solo8"])
-def test_a_locked_robot_is_that_of_pinocchio(name):
-    robot = mb.load(name)
-    rng = np.random.default_rng(3)
-    q0, _ = robot.random_state(rng)
-    names = [
-        robot.joint_names[k] for k in sorted(rng.permutation(len(robot.joint_names))[: len(robot.joint_names) // 2])
-    ]
-    reduced = robot.lock(names, q0)
-    raw = pin.buildModelFromUrdf(robot.source)
-    raw = pin.buildReducedModel(raw, [raw.getJointId(x) for x in names], in_pinocchio(robot, raw, q0, q0[:0])[0])
-    q, v = reduced.random_state(rng)
-    for engine in ("lagrangian", "pinocchio"):
-        assert_same_as(raw, mb.dynamics(reduced, engine), q, v)
-
-
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "mujoco"])
 def test_what_is_locked_keeps_its_energy_and_loses_its_friction(engine):
     """½ 20 (0.4 - 0.1)² + ½ 5 (3 0.4 - 0.5)² + 2 0.4⁴ J, beside ½ 7 q² of the other joints."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 import mbkit as mb
@@ -121,34 +120,6 @@ def test_gravity_and_springs_are_the_slope_of_the_potential(tree):
     _, dyn, (q, v, _, _) = tree
     slope = Differences(dyn, "potential_energy").along(0, q)[0]
     close(dyn.gravity(q) - dyn.passive(q, 0 * v), slope)
-
-
-@pytest.mark.thorough("anymal_b-True")
-@pytest.mark.parametrize(("robot", "floating"), [("ur5", False), ("panda", False), ("anymal_b", True)])
-def test_pinocchio_gives_the_same(robot, floating):
-    """Pinocchio's knows neither damping nor mimic joints: both are put around it here."""
-    model = mb.load(robot, floating_base=floating)
-    dyn, theirs = mb.dynamics(model, "lagrangian"), mb.dynamics(model, "pinocchio").pin_model
-    q, v, a, tau = (x[0] for x in states(model, 1))
-    layout = model.layout
-    G, data = layout.G, theirs.createData()
-    full_q, full_v = layout.G_q @ q + layout.offsets, G @ v
-    damping = np.diag(np.concatenate([j.damping for j in model.joints]))
-    by_q, by_v, M = (np.array(x) for x in pin.computeRNEADerivatives(theirs, data, full_q, full_v, G @ a))
-    M = np.triu(M) + np.triu(M, 1).T
-    mine = dyn.inverse_dynamics_derivatives(q, v, a)
-    for x, y in zip(mine, (by_q, by_v + damping, M), strict=True):
-        close(x, G.T @ y @ G)
-    if layout.reduced:
-        return
-    out = pin.computeABADerivatives(theirs, data, q, v, tau - damping @ v)
-    by_q, by_v, inverse = (np.array(x) for x in out)
-    inverse = np.triu(inverse) + np.triu(inverse, 1).T
-    condition = np.linalg.cond(M)
-    for x, y in zip(
-        dyn.forward_dynamics_derivatives(q, v, tau), (by_q, by_v - inverse @ damping, inverse), strict=True
-    ):
-        close(x, y, k=condition)
 
 
 def test_compiled_derivatives_are_those_interpreted():

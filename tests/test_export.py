@@ -321,27 +321,6 @@ def test_a_folder_without_permission_is_told(tmp_path):
 # The functions themselves, for optimal control.
 
 
-def test_functions_serve_in_an_optimal_control_expression():
-    # Two steps of Euler's method as MX, and the sensitivity of where they end to the torque.
-    model = mb.load("ur5").without("damping")
-    dyn = mb.dynamics(model, "lagrangian")
-    f = dyn.function("forward_dynamics")
-    h, n = 1e-2, model.nv
-    q0, v0, _, tau0 = (x[0] for x in states(model, 1))
-    tau = ca.MX.sym("tau", n)
-    q, v = ca.MX(q0), ca.MX(v0)
-    for _ in range(2):
-        a = f(q=q, v=v, tau=tau)["forward_dynamics"]
-        q, v = q + h * v, v + h * a
-    end = ca.Function("end", [tau], [q, ca.jacobian(q, tau)])
-    got, J = (x.full() for x in end(tau0))
-    step = dyn.forward_dynamics(q0, v0, tau0)
-    assert off(got[:, 0], q0 + h * v0 + h * (v0 + h * step)) < 64 * EPS
-    # q after two steps depends on the torque of the first alone: h² M(q0)⁻¹.
-    inverse = h * h * np.linalg.inv(dyn.mass_matrix(q0))
-    assert np.linalg.norm(J - inverse) < 256 * EPS * np.linalg.cond(dyn.mass_matrix(q0)) * np.linalg.norm(inverse)
-
-
 #: Of frames, their inputs; and of the whole.
 OF_BODIES = {
     **dict.fromkeys(("pose", "jacobian", "center_of_mass", "center_of_mass_jacobian"), "q"),

@@ -15,7 +15,6 @@ import casadi as ca
 import mpmath
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from mbkit.catalog import double_pendulum
 from mbkit.codegen import extended_precision, simd_kernel, taylor
@@ -390,35 +389,6 @@ def test_series_of_every_function_hold_its_integral(bits: int) -> None:
         exact = mp.quad(lambda t, f=f: f.exact(*given(f, t)), [0, 0.25, 0.5, 0.75])
         # Some ten steps; each adds a rounding or two to a sum of the size of its result.
         assert abs(mp.mpf(str(got)) - exact) <= 32 * mp.mpf(kind.eps) * (abs(exact) + 0.1), f.name
-
-
-def laws(q: Any, v: Any, own: Any) -> list[Any]:
-    """Return accelerations: a tanh for dry friction, a spring of Hertz's, a gust, a guide of a catenary, a stop."""
-    dry = -0.4 * own.tanh(3 * v[0]) - own.sinh(q[0]) / own.cosh(q[1])
-    hertz = -own.power(0.2 + q[1] * q[1], 1.5) + own.exp(-q[0] * q[0]) * own.atan(v[1])
-    drawn = own.log(2 + q[0]) - own.atan2(v[2] + 0.1, 2 + q[1]) - own.asinh(q[2]) + own.tan(0.3 * own.sin(q[2]))
-    return [dry, hertz, drawn - own.fmax(0, q[2] - 9)]
-
-
-def test_a_system_of_such_functions_moves_as_with_dop853() -> None:
-    pytest.importorskip("heyoka")
-    system = TaylorSystem(equations(lambda q, v: ca.vertcat(*laws(q, v, ca)), 3))
-    assert system.kinked
-    code, start = built(system.rates), np.array([0.3, -0.5, 0.2, 0.1, 0.4, -0.3])
-    rest = np.zeros(3)
-    kind = precision(53)
-    with system.integrator(kind, EPS) as integrator:
-        integrator.time = 0.0
-        integrator.state[:] = start
-        integrator.propagate_until(3.0)
-        series = integrator.state.copy()
-
-    def rates(_: float, y: np.ndarray) -> np.ndarray:
-        return np.concatenate([x.ravel() for x in code(y[:3], y[3:], rest)])
-
-    run = solve_ivp(rates, (0.0, 3.0), start, method="DOP853", rtol=1e-13, atol=1e-14)
-    # Some hundred steps of 1e-13 each at most, in a motion that spreads little in 3 s.
-    np.testing.assert_allclose(series, run.y[:, -1], rtol=0, atol=1e-11)
 
 
 def test_a_series_knows_where_it_may_take_the_wrong_branch() -> None:

@@ -1,8 +1,8 @@
 """Every kind of part on every path: right to rounding, or refused by the part's name.
 
-Each kind alone goes through each gate and along each path; models of several kinds are those of `tests.test_pairs`. A path
-that forgets a part gives another acceleration, motion or energy, and fails here; a refusal has to name a part. A kind
-without an example and a path without a check fail the suite.
+Each kind alone goes through each gate and along each path; models of several kinds are those of `tests.test_pairs`.
+A path that forgets a part gives another acceleration, motion or energy, and fails here; a refusal has to name a part.
+A kind without an example and a path without a check fail the suite.
 """
 
 # ruff: noqa: ARG001, ARG005  # all parts and all paths are called alike

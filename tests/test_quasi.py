@@ -14,8 +14,6 @@ from mbkit.derivation import equations_of
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian.system import Lagrangian, QuasiLagrangian
 from mbkit.spatial import rotate
-from validation import motions
-from validation.textbook import WheeledSpacecraft
 
 I1, I2, I3, m, ell, g, c, t, tau = sp.symbols("I1 I2 I3 m l g c t tau")
 phi, theta, psi = sp.symbols("phi theta psi")
@@ -64,19 +62,6 @@ def curved() -> QuasiLagrangian:
         parameters={m: 1.3, g: 0.7, c: 0.2},
     )  # fmt: skip
     return system.quasi_velocities([[1, x], [y, 2 + x * y]], ["a", "b"])
-
-
-def attitude(q: np.ndarray) -> np.ndarray:
-    """Return Rz(phi) Rx(theta) Rz(psi)."""
-
-    def turned(k: int, angle: float) -> np.ndarray:
-        i, j = (k + 1) % 3, (k + 2) % 3
-        R = np.eye(3)
-        R[i, i] = R[j, j] = np.cos(angle)
-        R[j, i], R[i, j] = np.sin(angle), -np.sin(angle)
-        return R
-
-    return turned(2, q[0]) @ turned(0, q[1]) @ turned(2, q[2])
 
 
 def matrix(quaternion: np.ndarray) -> np.ndarray:
@@ -419,44 +404,3 @@ def test_a_singular_start_is_refused(pair, method):
     dyn = quasi.dynamics(options={"compile": False})
     with pytest.raises(InputError, match=r"singular at \[0.0, 0.0, 0.5\]"):
         mb.simulate(dyn, [[1.0, 1.0, 1.0], [0.0, 0.0, 0.5]], [0.1, 0.2, 0.3], 0.1, method, save=[0.0, 0.1])
-
-
-def test_a_spacecraft_with_wheels_moves_alike_in_eulers_angles_in_body_rates_and_in_every_engine():
-    """Two slanting wheels with motors; beside them Euler's equation I ω̇ + ω × (I ω + h) = -ḣ, integrated."""
-    slanting = ((1.0, 0.0, 1.0), (-1.0, 0.0, 1.0))
-    closed = WheeledSpacecraft(wheel_axes=slanting)
-    n, inertia = len(closed.axes), closed.central_inertia
-    # One mirrors the other, so the body's axes are principal.
-    assert np.abs(inertia - np.diag(np.diag(inertia))).max() < 1e-15
-    A, B, C, J = sp.symbols("A B C J")
-    turns, sdot = sp.symbols(f"s1:{n + 1}"), sp.symbols(f"sdot1:{n + 1}")
-    rates, spins = W * sp.Matrix([u, w, s]), sp.Matrix(sdot)
-    axes = sp.Matrix([[1, 0, 1], [-1, 0, 1]]) / sp.sqrt(2)
-    T = (rates.T * sp.diag(A, B, C) * rates)[0] / 2 + J * (spins.T * axes * rates)[0] + J * (spins.T * spins)[0] / 2
-    values = dict(zip((A, B, C, J), (*np.diag(inertia), closed.wheel_inertia), strict=True))
-    angles = Lagrangian(T, 0, [phi, theta, psi, *turns], [u, w, s, *sdot], parameters=values, name="spacecraft")
-    body = angles.quasi_velocities(sp.diag(D, sp.eye(n)))
-    rng = np.random.default_rng(1)
-    q, rate = np.array([0.3, 1.0, -0.4, *np.zeros(n)]), np.array([0.2, -0.1, 0.3, *rng.uniform(-40, 40, n)])
-    torques, save = rng.uniform(-0.2, 0.2, n), [0.0, 0.5, 1.0]
-    tau = np.array([0.0, 0.0, 0.0, *torques])
-    R, turning, spinning = motions.wheeled(save, closed, attitude(q), rate[:3], rate[3:], torques)
-    told, own = np.hstack([turning, spinning]), {"compile": False}
-    one = mb.simulate(body.dynamics(options=own), q, rate, 1.0, "rk853", rtol=1e-13, torque=tau, save=save)
-    two = mb.simulate(
-        angles.dynamics(options=own), q, body.to_velocity(q, rate), 1.0, "rk853", rtol=1e-13, torque=tau, save=save
-    )
-    # Of 40 rad/s.
-    assert np.abs(one.q - two.q).max() < 40 * CLOSE
-    for ours in (one.v, body.to_quasi_velocity(two.q, two.v)):
-        assert np.abs(ours - told).max() < 40 * CLOSE
-    for ours, theirs in zip(one.q, R, strict=True):
-        assert attitude(ours) == pytest.approx(theirs, abs=CLOSE)
-    model = mb.catalog.spacecraft_with_wheels(wheel_axes=slanting)
-    # The centre of mass rests, so the hub's centre does not: what is compared does not depend on it.
-    start = np.array([*-np.cross(rate[:3], closed.com), *rate])
-    tau = np.array([0.0] * 6 + [*torques])
-    for engine in ("lagrangian", "pinocchio", "mujoco"):
-        dyn = mb.dynamics(model, engine)
-        run = mb.simulate(dyn, model.neutral(), start, 1.0, "rk853", rtol=1e-13, torque=tau, save=save)
-        assert np.abs(run.v[:, 3:] - told).max() < 40 * CLOSE

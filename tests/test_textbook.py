@@ -12,6 +12,7 @@ from scipy.linalg import eigh
 
 from mbkit import catalog
 from mbkit.engines import dynamics
+from mbkit.errors import InputError
 from mbkit.model import Model
 from mbkit.simulate import simulate
 from validation import motions, textbook
@@ -425,79 +426,6 @@ def test_kapitza_kinetic_energy_splits() -> None:
 # Routh
 
 
-def missed(form: Any, low: float, high: float) -> float:
-    """Return by how much a motion kept each 5 ms misses its turning points: θ̈ h²/8."""
-    return float(max(abs(form.acceleration(low)), abs(form.acceleration(high))) * 0.005**2 / 8)
-
-
-def test_reduced_spherical_pendulum_moves_as_the_whole() -> None:
-    model = catalog.spherical_pendulum(length=0.7, mass=1.3)
-    theta, turning, swinging = 0.9, 2.1, 0.6
-    form = textbook.ReducedPendulum(1.3 * 0.7**2 * np.sin(theta) ** 2 * turning, 0.7, 1.3)
-    h = 1e-5
-    slope = (form.effective_potential(theta + h) - form.effective_potential(theta - h)) / (2 * h)
-    assert form.acceleration(theta) == pytest.approx(-slope / (1.3 * 0.7**2), rel=1e-8)
-    assert form.azimuth_rate(theta) == pytest.approx(turning, rel=8 * EPS)
-    energy = 1.3 * 0.7**2 * swinging**2 / 2 + form.effective_potential(theta)
-    low, high = form.limits(energy)
-    for end in (low, high):
-        assert form.effective_potential(end) == pytest.approx(energy, rel=1e-12)
-    # At azimuth 0 and in its plane: α = θ, and β turns with the azimuth.
-    run = simulate(
-        dynamics(model),
-        [theta, 0.0],
-        [swinging, turning * np.sin(theta)],
-        4.0,
-        "rk853",
-        rtol=1e-12,
-        save=np.linspace(0, 4, 801),
-    )
-    cosine = np.cos(run.q[:, 0]) * np.cos(run.q[:, 1])
-    angle = np.arccos(cosine)
-    assert (angle.min(), angle.max()) == pytest.approx((low, high), abs=missed(form, low, high))
-    reduced = solve_ivp(
-        lambda _, y: [y[1], form.acceleration(y[0])], (0, 4), [theta, swinging], method="DOP853", rtol=1e-12, atol=1e-12
-    )
-    assert reduced.y[0, -1] == pytest.approx(angle[-1], abs=1e-10)
-
-
-def top() -> tuple[textbook.ReducedTop, np.ndarray, float]:
-    """Return the default heavy top reduced, its ω at the start and the reduced energy; its axis starts at θ = π/2."""
-    w = np.array([0.4, 30.0, -4.6])
-    across, along, weight = 0.234375 + 15.0, 0.46875, 15.0 * 9.81
-    # The axis is the body's y and lies along the world's y; p_φ is about the world's z.
-    form = textbook.ReducedTop(across, along, weight, across * w[2], along * w[1])
-    energy = across * (w[0] ** 2 + w[2] ** 2) / 2
-    return form, w, energy
-
-
-def test_reduced_top_moves_as_the_whole() -> None:
-    form, w, energy = top()
-    model = catalog.heavy_top()
-    low, high = form.limits(energy)
-    for end in (low, high):
-        assert form.effective_potential(end) == pytest.approx(energy, abs=1e-11 * form.weight)
-    h = 1e-5
-    slope = (form.effective_potential(1.3 + h) - form.effective_potential(1.3 - h)) / (2 * h)
-    assert form.acceleration(1.3) == pytest.approx(-slope / form.across, rel=1e-8)
-    assert form.ignored_rates(np.pi / 2) == pytest.approx((w[2], w[1]), rel=8 * EPS)
-    times = np.linspace(0, 3, 601)
-    run = simulate(dynamics(model), [0.0, 0.0, 0.0, 1.0], w, 3.0, "rk853", rtol=1e-12, save=times)
-    x, y, z, s = run.q.T
-    # The world's z of the body's y.
-    angle = np.arccos(2 * (y * z + x * s))
-    assert (angle.min(), angle.max()) == pytest.approx((low, high), abs=missed(form, low, high))
-    reduced = solve_ivp(
-        lambda _, y: [y[1], form.acceleration(y[0])],
-        (0, 3),
-        [np.pi / 2, -w[0]],
-        method="DOP853",
-        rtol=1e-12,
-        atol=1e-12,
-    )
-    assert reduced.y[0, -1] == pytest.approx(angle[-1], abs=1e-9)
-
-
 def test_a_top_sleeps_when_it_spins_fast_enough() -> None:
     """The upright's potential has a minimum on one side of the threshold and a maximum on the other."""
     edge = 2 * np.sqrt(1.5 * 20.0)
@@ -505,3 +433,35 @@ def test_a_top_sleeps_when_it_spins_fast_enough() -> None:
         form = textbook.ReducedTop(1.5, 0.4, 20.0, p, p)
         assert form.sleeps() == stable
         assert (form.acceleration(0.01) < 0) == stable
+
+
+BAD: list[tuple[str, str, Any]] = [
+    ("elastic_pendulum", "stiffness", 0.0),
+    ("elastic_pendulum", "length", -1.0),
+    ("acrobot", "inertia2", np.nan),
+    ("acrobot", "com1", 0.0),
+    ("furuta_pendulum", "pendulum_inertia", (1.0, 1.0, 3.0)),
+    ("furuta_pendulum", "arm_length", 0.0),
+    ("gyroscope", "offset", -0.1),
+    ("gyroscope", "rotor_axial", 1.0),
+    ("gyroscope", "inner_inertia", (1.0, 2.0)),
+    ("spacecraft_with_wheels", "wheel_axes", []),
+    ("spacecraft_with_wheels", "wheel_axes", (1.0, 0.0, 0.0)),
+    ("spacecraft_with_wheels", "wheel_axes", "xyz"),
+    ("spacecraft_with_wheels", "wheel_axes", [[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]),
+    ("spacecraft_with_wheels", "wheel_axes", [[1.0, np.nan, 0.0]]),
+    ("spacecraft_with_wheels", "wheel_axes", [[1.0, 0.0, 0.0], [0.0, 1.0]]),
+    ("spacecraft_with_wheels", "wheel_distance", -0.1),
+    ("clamped_beam", "segments", 0),
+    ("clamped_beam", "bending_stiffness", 0.0),
+    ("flexible_spacecraft", "hub", "ball"),
+    ("flexible_spacecraft", "segments", 2.5),
+    ("flexible_spacecraft", "hub_inertia", (1.0, 1.0, 3.0)),
+    ("flexible_spacecraft", "hub_radius", -1.0),
+]
+
+
+@pytest.mark.parametrize(("name", "parameter", "value"), BAD)
+def test_bad_parameters_are_named(name: str, parameter: str, value: Any) -> None:
+    with pytest.raises(InputError, match=rf"^{parameter}: .*expected"):
+        catalog.get(name)(**{parameter: value})

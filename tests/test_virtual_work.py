@@ -131,29 +131,6 @@ def test_pendulum_hangs_stably_and_stands_unstably(engine):
         equilibrium(dyn, tau=[100.0])
 
 
-def test_bead_on_the_hoop_leaves_the_bottom_above_the_threshold():
-    bead = Lagrangian(
-        m * R**2 * (w**2 + Om**2 * sp.sin(th) ** 2) / 2,
-        -m * g * R * sp.cos(th),
-        [th],
-        [w],
-        parameters={m: 1.0, R: 0.7, g: 9.81, Om: None},
-    )
-    threshold = np.sqrt(9.81 / 0.7)
-    for rate in (0.5 * threshold, 0.99 * threshold):
-        bottom = equilibrium(bead.dynamics(options=OWN, Omega=rate), [0.0])
-        assert bottom.stable is True
-        assert bottom.frequencies[0] == pytest.approx(np.sqrt(threshold**2 - rate**2), rel=1e-12)
-    for rate in (1.01 * threshold, 2.0 * threshold):
-        dyn = bead.dynamics(options=OWN, Omega=rate)
-        assert equilibrium(dyn, [0.0]).stable is False
-        side = equilibrium(dyn, [1.3])
-        assert np.cos(side.q[0]) == pytest.approx((threshold / rate) ** 2, rel=1e-12)
-        assert side.stable is True
-        assert side.frequencies[0] == pytest.approx(rate * np.sin(side.q[0]), rel=1e-11)
-    assert equilibrium(bead.dynamics(options=OWN, Omega=threshold), holding=[0.0]).stable is None
-
-
 @pytest.mark.parametrize("robot", ["ur5", "panda"])
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "mujoco"])
 def test_holding_torque_of_a_robot_with_a_payload(robot, engine):
