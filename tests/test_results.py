@@ -10,11 +10,12 @@ from dataclasses import replace
 
 import pytest
 
+from mbkit._escape import html, markdown
 from mbkit.errors import InputError, OutputError
 from mbkit.studies.baseline.description import Change
 from mbkit.studies.baseline.result import BaselineResult, ChangedNumber, VersionChange
 from mbkit.studies.compare.result import Comparison
-from mbkit.studies.document import Column, Table, block_html, block_markdown
+from mbkit.studies.document import Column, Items, Paragraph, Table, block_html, block_markdown, plain
 from mbkit.studies.explain.joint_matching import Match
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.terms import Gap
@@ -146,6 +147,25 @@ def test_markdown_and_html_escape_texts_and_write_numbers_as_asked():
     )
     for result in RESULTS.values():
         assert "<mesh>" not in result._repr_html_() + result.to_markdown()
+
+
+@pytest.mark.parametrize("name", [*RESULTS, "study", "stress"])
+def test_markdown_shows_what_a_page_shows_and_a_notebook_what_a_terminal_shows(name):
+    result = {**RESULTS, "study": STUDY, "stress": RESULT}[name]
+    whole = result.document()
+    for where, text, escape in (("page", result.to_markdown(), markdown), ("terminal", result._repr_html_(), html)):
+        assert escape(whole.verdict) in text
+        for section, blocks in whole.shown(where):
+            shown = [section.title]
+            for block in blocks:
+                if isinstance(block, Items):
+                    shown += [bullet.line for bullet in block.bullets]
+                elif isinstance(block, Paragraph):
+                    shown.append(plain(block.text))
+                elif isinstance(block, Table):
+                    shown += [plain(c.head) for c in block.shown(where)]
+                    shown += [plain(cell) for group in block.groups(where) for row in group for cell in row]
+            assert not [part for part in shown if escape(part) not in text]
 
 
 def test_plain_data_has_no_number_that_json_has_not():

@@ -116,11 +116,6 @@ def name_points(lines: Iterable[Line2D], texts: Iterable[str]) -> None:
         line.set_gid(name)
 
 
-def error_words(x: float) -> str:
-    """Return an error as the text of a point has it."""
-    return f"{x:.1e}" if math.isfinite(x) else "NaN" if math.isnan(x) else "∞"
-
-
 def log_ticks(ax: Axes, most: int = 9) -> None:
     """Label powers of ten on the logarithmic axes, with at most so many ticks."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator

@@ -13,7 +13,6 @@ from mbkit.simulate.plotting.style import (
     PLAIN,
     Palette,
     engine_mark,
-    error_words,
     figure_of,
     legend,
     log_ticks,
@@ -60,7 +59,7 @@ def figure(
         # One line for all terms: Matplotlib's time goes by the lines.
         for kind, look in (("median", {"marker": "|", "markersize": 8}), ("worst", {"marker": engine_mark(engine)})):
             texts = [
-                f"{r.term}, {engine}: {kind} error {error_words(x)}"
+                f"{r.term}, {engine}: {kind} error {error_text(x)}"
                 for (_, r), x in zip(shown, errors[kind], strict=True)
             ]
             name_points(ax.plot(ends[kind], y, ls="none", color=colour, **look), texts)
