@@ -72,6 +72,11 @@ def start_state(model: Model, seed: int) -> tuple[Array, Array]:
     return q, 0.1 * v
 
 
+def whole_steps(interval: float, step: float) -> int:
+    """Return the least number of equal steps, none longer than `step` but by rounding, that fill an interval."""
+    return max(1, int(np.ceil(interval / step * (1 - 1e-9))))
+
+
 class TooLongError(MbkitError):
     """A run took longer than it is worth."""
 

@@ -12,6 +12,7 @@ from mbkit._check import Array, real
 from mbkit.errors import InputError
 from mbkit.model import Model
 from mbkit.studies.measurement import Problem
+from mbkit.studies.study_runs import whole_steps
 
 #: Families stand in the order of a study: stiff ones first, those that take longest last.
 Family = Literal["stiffness", "mass ratio", "length", "spin", "near-singular", "friction", "large", "step", "long"]
@@ -116,4 +117,4 @@ def step_of(problem: Problem, times: Array, dt: float) -> float:
     if problem.dt is not None:
         return problem.dt
     interval = float(times[1])
-    return interval / max(1, int(np.ceil(interval / dt * (1 - 1e-9))))
+    return interval / whole_steps(interval, dt)

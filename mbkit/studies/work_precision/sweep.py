@@ -29,7 +29,7 @@ from mbkit.model import Model
 from mbkit.simulate import Trajectory
 from mbkit.studies.measurement import Measurement, Problem, Truth, farthest
 from mbkit.studies.results import Refusal
-from mbkit.studies.study_runs import OUT_OF_TIME, Deadline, TooLongError, quiet_simulate
+from mbkit.studies.study_runs import OUT_OF_TIME, Deadline, TooLongError, quiet_simulate, whole_steps
 from mbkit.studies.work_precision.curve import Curve, gains_nothing, observed_order
 from mbkit.studies.worker import run
 
@@ -145,7 +145,7 @@ def plans(
             settings.append(Settings(engine, name, "rtol", values, tolerances is not None))
         else:
             wanted = _steps(method, interval) if steps is None else steps
-            counts = sorted({max(1, int(np.ceil(interval / h * (1 - 1e-9)))) for h in wanted})
+            counts = sorted({whole_steps(interval, h) for h in wanted})
             settings.append(Settings(engine, name, "dt", tuple(interval / n for n in counts), steps is not None))
     return tuple(settings)
 
