@@ -54,7 +54,7 @@ _DATA, _RANK, _SHAPE, _STRIDES, _DTYPE = _HEAD, _HEAD + 1, _HEAD + 2, _HEAD + 3,
 #: Letters, byte order, flags and number of a type, in eight bytes.
 _KIND: Final = _HEAD + 1
 _TABLE: Final = 3 + 4 * 2 * MAX_ARRAYS
-# Places in the array of numbers: what holds of every function in this process, then what is its own.
+# Places in the array of numbers: those of every function in this process, then a function's own.
 (_ARRAY, _FLOAT, _DOUBLE_KIND, _TAKE, _GIVE, _NONE, _KEEP, _DROP, _NEW_ARRAY, _NEW_FLOAT, _NEW_TUPLE, _SET) = range(12)
 (_INPUTS, _RESULTS, _BYTES, _TABLE_AT, _QUATERNIONS, _CALLS, _LISTS) = range(12, 19)
 _MAX_AXES: Final = 4

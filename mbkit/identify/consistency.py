@@ -1,4 +1,4 @@
-"""Physically consistent parameters: those of matter, nearest to the data and to what is known before.
+"""Physically consistent parameters: those of matter, nearest to the data and to prior knowledge.
 
 A body's ten parameters belong to some distribution of mass if and only if its pseudo-inertia J is positive definite
 (Wensing, Kim and Slotine 2018, Linear matrix inequalities for physically consistent inertial parameter
@@ -27,7 +27,7 @@ from mbkit.model.base_parameters import STANDARD, BaseParameters, parameters_of,
 
 ENTROPIC, EUCLIDEAN = "entropic", "euclidean"
 PRIORS: Final = (ENTROPIC, EUCLIDEAN)
-#: Least eigenvalue of X, so that what is written down is matter after rounding too.
+#: Least eigenvalue of X, so that written numbers are matter after rounding too.
 _MIN_EIGENVALUE: Final = 1e-6
 #: Least extent of a body, relative to its largest, so that L exists.
 _POINT_EXTENT_RATIO: Final = 1e-6

@@ -167,7 +167,7 @@ def bias(
     nv, rng = data.v.shape[1], np.random.default_rng(0)
     L = _root(errors.T @ errors / len(errors))
 
-    # Each with its opposite: what is odd in the noise is chance, and the bias is even.
+    # Each with its opposite: odd powers of the noise are chance, and the bias is even.
     halves = [rng.standard_normal((len(data), 2 * nv)) @ L.T for _ in range(_NOISE_DRAWS)]
     draws = [sign * x for x in halves for sign in (1.0, -1.0)]
 
@@ -192,7 +192,7 @@ def _first(data: Measurements, count: int) -> Measurements:
 
 
 def _beside_neighbours(x: Array) -> Array:
-    """Return what is left of each sample beside a polynomial through it and its neighbours, as large as its noise."""
+    """Return each sample's residual beside a polynomial through it and its neighbours, as large as its noise."""
     k = np.arange(-_SIDE_SAMPLES, _SIDE_SAMPLES + 1.0)
     A = np.vander(k / _SIDE_SAMPLES, _POLYNOMIAL_COEFFICIENTS)
     H = np.eye(len(k)) - A @ np.linalg.pinv(A)

@@ -193,7 +193,7 @@ class Identification(ResultTable):
                 if names and names[0] in estimates:
                     offset = getattr(joint, field) - model.per_velocity(field)[model.layout.v[joint.name]]
                     values = np.array([estimates[n].value for n in names]) + offset
-                    # Rounding and noise of what is zero have any sign.
+                    # Rounding and noise of a zero have any sign.
                     deviations = np.array([estimates[n].deviation if estimates[n].determined else 0.0 for n in names])
                     insignificant = (values < 0) & (values >= -SIGNIFICANT_DEVIATIONS * deviations)
                     changes[field] = np.where(insignificant, 0.0, values)

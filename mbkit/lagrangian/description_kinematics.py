@@ -433,8 +433,8 @@ def closure(kin: SymbolicKinematics, loop: Loop) -> list[sp.Expr]:
     )
     loop_ends = LoopEnds([x - y for x, y in zip(*points, strict=True)], frame_a, frame_b, values.length)
     apart = "its axes never cross at a right angle" if loop.kind == CROSSED else "its frames are never parallel"
-    told = ("its points never meet", apart)
-    messages = [f"loop {loop.name!r}: {told[name in TURNING]}" for name in names]
+    reasons = ("its points never meet", apart)
+    messages = [f"loop {loop.name!r}: {reasons[name in TURNING]}" for name in names]
     axes = [axis for way in ends for axis in _axes(way)] if loop.kind in WELDED else []
     if loop.kind in WELDED and all(np.linalg.norm(np.cross(axis, axes[0])) < DEPENDENT for axis in axes):
         rows = _independent(kin, rows_of(loop_ends)[: -len(loop_ends.turn())], messages)

@@ -164,7 +164,7 @@ def _scalar(x: Any, things: list[Expression]) -> Any:
 
 
 def read_spline(value: Any, ends: Ends) -> tuple[Array, Array] | None:
-    """Return the knots and coefficients of a spline or a table (t, x); None for what is neither.
+    """Return the knots and coefficients of a spline or a table (t, x); None for any other value.
 
     Parameters
     ----------

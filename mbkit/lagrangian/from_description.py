@@ -190,7 +190,7 @@ def _with_points(model: Model) -> Model:
 
 
 def _turned(model: Model, end: Joint) -> str:
-    """Return what is more than a mass at the end of a beam; empty without anything."""
+    """Return the parts at the end of a beam that are more than a mass; empty without any."""
     beyond = {end.child}
     for joint in model.tree:
         if joint.parent in beyond:

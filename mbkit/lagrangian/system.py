@@ -55,7 +55,7 @@ class Lagrangian(EnergyForm):
     V : sympy.Expr
         Potential energy, of coordinates, parameters and time; J. Terms linear in the velocities make it a generalized
         potential, such as -e A·v of a charge in a magnetic field (Goldstein et al. 2002, ch. 1.5); they are kept as
-        terms of T with the other sign, so that L = T - V and what is conserved are right, and T + V is no energy.
+        terms of T with the other sign, so that L = T - V and conserved quantities are right, and T + V is no energy.
     coordinates : sequence of sympy symbols
         Plain symbols, or `sympy.physics.mechanics.dynamicsymbols`.
     velocities : sequence of sympy symbols, optional

@@ -341,7 +341,7 @@ class Transmissions:
         """Return what has the length before the gear."""
         own = element.attributes
         name, tendon = own.get("jointinparent", own.get("joint", "")), own.get("tendon")
-        # The last one wins in MuJoCo, in this order: joint, tendon, and what is no coordinate.
+        # The last one wins in MuJoCo, in this order: joint, tendon, site or body.
         if any(x in own for x in ("cranksite", "site", "body")):
             return Acting(item, "")
         if tendon is not None and tendon not in self._known:

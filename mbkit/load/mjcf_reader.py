@@ -259,7 +259,7 @@ def _suffixed(element: Element, suffix: str, names: Mapping[str, Container[str]]
 
 # Attached models
 
-#: Settings of <compiler> that what is attached must share; orientations and angles are converted.
+#: Settings of <compiler> that an attached file must share; orientations and angles are converted.
 _SHARED_SETTINGS: Final = [
     "autolimits",
     "inertiafromgeom",
@@ -275,7 +275,7 @@ def write_out_attached(mujoco: Element, path: Path, compiler: Compiler, read: Re
     """Write the parts of other files that <attach> names in its place, as MuJoCo 4.0.0 does, and return a note.
 
     All names get the prefix. Defaults become a class of their own; meshes, and the tendons, actuators and equalities
-    that name nothing but what is attached, are added. Options of the other file do not count.
+    that name attached elements only, are added. Options of the other file do not count.
     """
     attacher, worlds = _Attacher(mujoco, path, compiler, read), mujoco.all("worldbody")
     if any(e.tag == "attach" for world in worlds for e in world.walk()):
@@ -286,7 +286,7 @@ def write_out_attached(mujoco: Element, path: Path, compiler: Compiler, read: Re
 
 
 def _set_main_apart(mujoco: Element) -> None:
-    """Move the main default class into one of its own, which reaches all of the file but what is attached."""
+    """Move the main default class into one of its own, which reaches all of the file but attached elements."""
     tops = mujoco.all("default")
     inside = [e for top in tops for e in top.children]
     if not any(e.tag != "default" and e.attributes for e in inside):
@@ -331,7 +331,7 @@ class _Attacher:
     left: int = MAX_ELEMENTS
 
     def attached(self, element: Element) -> list[Element]:
-        """Return what is attached; nothing after a fault."""
+        """Return the attached elements; none after a fault."""
         own, read = element.attributes, self.read
         model, prefix = (read.name(element, name, "<attach>") for name in ("model", "prefix"))
         if model not in self.others:
@@ -420,7 +420,7 @@ class _Attacher:
         self.mujoco.children.append(Element("asset", {}, element.line, meshes, file=other.file))
 
     def _add_naming(self, parts: list[Element], prefix: str, other: _Other) -> None:
-        """Add the tendons, actuators and equalities that name nothing but what is attached."""
+        """Add the tendons, actuators and equalities that name attached elements only."""
         names = _names(parts)
         for tag in _SECTIONS_WITH_REFERENCES:
             for section in other.root.all(tag):
@@ -481,7 +481,7 @@ class _Prefixed:
 
 
 def class_inside(element: Element, childclass: str | None) -> str | None:
-    """Return the class that reaches what is inside an element; MuJoCo takes a frame's class for its childclass."""
+    """Return the class that reaches the children of an element; MuJoCo takes a frame's class for its childclass."""
     own, framed = element.attributes, element.tag in ("frame", "replicate")
     return own.get("childclass", own.get("class", childclass) if framed else childclass)
 
@@ -496,7 +496,7 @@ def _names(elements: Iterable[Element]) -> dict[str, set[str]]:
 
 
 def _inside(element: Element, names: Mapping[str, Container[str]]) -> list[bool]:
-    """Return of each part that an element names whether it is among some names."""
+    """Return True for each part that an element names if it is among some names."""
     ends = [(_REFERENCES.get(k.rstrip("12"), ""), x) for y in element.walk() for k, x in y.attributes.items()]
     return [x in names.get(kind, ()) for kind, x in ends if kind]
 

@@ -122,7 +122,7 @@ class _Drawing:
         order = np.argsort(depth.mean(axis=1))
         self.solids.set_verts(projected[order])
         self.solids.set_facecolor(colors[order])
-        # The edge closes the gap between neighbours, and would show on what is transparent.
+        # The edge closes the gap between neighbours, and would show on transparent ones.
         self.solids.set_edgecolor(colors[order] * np.where(colors[order, 3:] < 1, [1, 1, 1, 0], 1))
         if len(self.scene.t) > 1:
             self.clock.set_text(f"{self.scene.t[k]:.2f} s")

@@ -14,7 +14,7 @@ from mbkit._check import Array
 
 Indices = NDArray[np.int64]
 Color = tuple[float, float, float, float]
-#: Sides of what is round.
+#: Sides of a round shape.
 _ROUND_SIDES: Final = 32
 #: A mesh of fewer triangles stays as it is, and one of more is at least so many cells long.
 _MIN_CLUSTERED_TRIANGLES: Final = 150

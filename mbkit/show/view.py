@@ -91,7 +91,7 @@ def show(
     Parameters
     ----------
     model : Model, str or path
-        Or what `mbkit.load` takes, such as a path; inertias that no body has are told, and drawn.
+        Or an argument of `mbkit.load`, such as a path; inertias that no body has bring a warning, and are drawn.
     q : (nq,) or (K, nq) array_like, optional
         By default the neutral configuration.
     path : str or path, optional

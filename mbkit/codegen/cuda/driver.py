@@ -183,7 +183,7 @@ def device_of(name: str) -> Device:
     UnknownNameError
         Another name.
     UnsupportedError
-        Without cuda-bindings, a driver or this GPU; with what is missing.
+        Without cuda-bindings, a driver or this GPU; the message names the missing one.
     """
     kind, _, number_ = name.partition(":") if isinstance(name, str) else ("", "", "")
     if kind != CUDA or (number_ and not number_.isdecimal()) or (not number_ and ":" in name):

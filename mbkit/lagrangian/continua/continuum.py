@@ -163,7 +163,7 @@ class Continuum(Densities):
         Raises
         ------
         InputError
-            A shape that moves what is fixed (it is named), or holds parameters other than the ends.
+            A shape that moves a fixed place (it is named), or holds parameters other than the ends.
         UnsupportedError
             Energies that are no polynomial of the fields and their derivatives.
         """

@@ -166,7 +166,7 @@ class _Ritz:
         return measure
 
     def _basis(self, powers: int) -> Any:
-        """Return columns of powers, field by field, that keep what is fixed."""
+        """Return columns of powers, field by field, that keep fixed places."""
         size, rows = len(self._system.jets.fields) * powers, []
         for place, end in enumerate(self._system.ends):
             for s in self._system.fixed[end]:
@@ -212,7 +212,7 @@ class _Ritz:
                 raise NumericalError("T: some shape of a field has no kinetic energy, or a negative one")
             shift, L = mpmath.mpf(0), _cholesky(K)
             if L is None:
-                # Motions as a rigid body: what is left of them is small beside the slowest other one.
+                # Motions as a rigid body: their remainder is small beside the slowest other one.
                 ratios = [K[i, i] / M[i, i] for i in range(K.rows)]
                 shift = min((x for x in ratios if x > _ZERO_PIVOT_RATIO * max(ratios)), default=mpmath.mpf(1))
                 L = _cholesky(K + shift * M)
