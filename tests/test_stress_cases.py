@@ -125,6 +125,7 @@ def test_exact_motions_satisfy_the_equation_of_motion(case: Case) -> None:
     assert np.abs(sum(parts)).max() < 1e-6 * size + rounding
 
 
+@pytest.mark.thorough(every=2)
 @pytest.mark.parametrize("case", MOTIONS, ids=ids)
 def test_starts_are_consistent(case: Case) -> None:
     """At the most extreme value, too, where only the beginning can be looked at."""

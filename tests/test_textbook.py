@@ -110,6 +110,7 @@ def states(model: Model, count: int = 6) -> list[tuple[np.ndarray, np.ndarray]]:
 # Terms
 
 
+@pytest.mark.thorough(every=2)
 @pytest.mark.parametrize("name", ENGINES)
 @pytest.mark.parametrize("case", CASES)
 def test_engines_agree_with_closed_forms(case: str, name: str) -> None:

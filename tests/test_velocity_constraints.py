@@ -276,7 +276,7 @@ def eliminated(name: str) -> list[NonholonomicEquations]:
     return [getattr(lag, way)(rates) for way in WAYS]
 
 
-@pytest.mark.thorough("ball on a table", "suslov in numbers", "car")
+@pytest.mark.thorough("ball on a table", "suslov in numbers", "car", "disc in body rates", "heavy suslov")
 @pytest.mark.parametrize("name", ON_ONE_PAGE)
 def test_the_three_eliminations_print_the_same_text(name) -> None:
     made = eliminated(name)
