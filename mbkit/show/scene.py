@@ -207,7 +207,7 @@ class Scene:
 
     @cached_property
     def camera(self) -> dict[str, Any]:
-        """Return a camera of 35° that sees everything: target and distance in m, azimuth and elevation in rad."""
+        """A camera of 35° that sees everything, as target and distance in m, azimuth and elevation in rad."""
         low, high = self.bounds
         wide, deep = (high - low)[:2]
         # A motion in a plane is seen from its side, and a robot that looks along x from the front.
