@@ -22,11 +22,14 @@ from typing import Any, Final
 from weakref import WeakValueDictionary
 
 import casadi as ca
+import numpy as np
 
+from mbkit._check import Array
 from mbkit._version import __version__
 from mbkit.codegen import disk_cache as disk
 from mbkit.codegen import jit
 from mbkit.codegen.batch_loop import RUN
+from mbkit.codegen.compiled import aligned
 from mbkit.codegen.llvm_ir import declarations, library
 from mbkit.codegen.program import Program, program
 from mbkit.codegen.simd_kernel import Piece, pieces_of, slots_of
@@ -53,6 +56,33 @@ class CompiledStepLoop:
         self.size = int(about["size"])
         self.operations = int(about["operations"])
         self.loaded = jit.load(code)
+
+
+class Arena:
+    """The numbers of a compiled step loop, in rows with one for each lane, and its calls.
+
+    `state` are the rows with which a round ends, of the names from which the next one starts; `at` is where each is
+    among these.
+    """
+
+    def __init__(self, code: CompiledStepLoop, names: Sequence[str]) -> None:
+        self.code, rows = code, code.rows
+        self._numbers = aligned(code.size * width()).reshape(code.size, width())
+        self._numbers[:] = 0.0
+        first = rows[f"{names[0]}1"][0]
+        self.at = {name: slice(rows[f"{name}1"][0] - first, sum(rows[f"{name}1"]) - first) for name in names}
+        self.state = self._numbers[first : first + sum(rows[name][1] for name in names)]
+        self._ways = np.zeros(5, dtype=np.int64)
+
+    def __getitem__(self, name: str) -> Array:
+        start, count = self.code.rows[name]
+        return self._numbers[start : start + count]
+
+    def run(self, source: Array, log: Array, rounds: int, *, on: bool) -> int:
+        """Run rounds and return how many; `on` from the state that the last one left, else from one each."""
+        self._ways[:] = source.ctypes.data, 0 if on else self.state.nbytes, log.ctypes.data, 0, on
+        self.code.loaded.run(self._numbers.ctypes.data, self._ways.ctypes.data, 0, rounds)
+        return int(self._ways[3])
 
 
 def compiled_step_loop(

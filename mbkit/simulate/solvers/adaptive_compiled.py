@@ -13,7 +13,7 @@ import numpy as np
 
 from mbkit._check import EPS, Array
 from mbkit.codegen.compiled import aligned
-from mbkit.codegen.step_loop import CompiledStepLoop, compiled_step_loop, width
+from mbkit.codegen.step_loop import Arena, CompiledStepLoop, compiled_step_loop, width
 from mbkit.derivation.steps.adaptive import STATE, embedded_parts
 from mbkit.derivation.steps.rosenbrock import rosenbrock_parts
 from mbkit.engines.lagrangian import LagrangianDynamics
@@ -43,28 +43,11 @@ def _code(dyn: LagrangianDynamics, own: EmbeddedTableau | RosenbrockTableau) -> 
     return codes[own.name]
 
 
-class _Arena:
-    """The room of one function, and its calls."""
-
-    def __init__(self, code: CompiledStepLoop, tolerances: Tolerances, least: float) -> None:
-        self._code = code
-        self.room = aligned(code.size * width()).reshape(code.size, width())
-        self.room[:] = 0.0
-        first = code.rows[f"{STATE[0]}1"][0]
-        self.state = self.room[first : first + sum(code.rows[name][1] for name in STATE)]
-        for name, value in (("rtol", tolerances.rtol), ("atol", tolerances.atol), ("least", least)):
-            self[name][:] = value
-        self._ways = np.zeros(5, dtype=np.int64)
-
-    def __getitem__(self, name: str) -> Array:
-        start, count = self._code.rows[name]
-        return self.room[start : start + count]
-
-    def run(self, source: Array, log: Array, rounds: int, *, on: bool) -> int:
-        """Run rounds and return how many; `on` from the state that the last one left, else from one each."""
-        self._ways[:] = source.ctypes.data, 0 if on else self.state.nbytes, log.ctypes.data, 0, on
-        self._code.loaded.run(self.room.ctypes.data, self._ways.ctypes.data, 0, rounds)
-        return int(self._ways[3])
+def _arena(code: CompiledStepLoop, tolerances: Tolerances, least: float) -> Arena:
+    out = Arena(code, STATE)
+    for name, value in (("rtol", tolerances.rtol), ("atol", tolerances.atol), ("least", least)):
+        out[name][:] = value
+    return out
 
 
 class CompiledAttempts:
@@ -87,14 +70,12 @@ class CompiledAttempts:
         self._stages = own.stages + self._stiff
         self._rate, self._grows = ("k", 5) if self._stiff else ("k_0", 8)
         self._code = _code(problem.dyn, own)
-        self._outer = _Arena(self._code, tolerances, problem.duration * EPS)
-        self._inner: _Arena | None = None
+        self._outer = _arena(self._code, tolerances, problem.duration * EPS)
+        self._inner: Arena | None = None
         self._tolerances, self._of_place = tolerances, [tolerances] * width()
         self.width, self.rounds = width(), ROUNDS
         self._log = aligned(ROUNDS * self._outer.state.size).reshape(ROUNDS, *self._outer.state.shape)
-        rows = self._code.rows
-        zero = rows[f"{STATE[0]}1"][0]
-        self._at = {name: slice(rows[f"{name}1"][0] - zero, sum(rows[f"{name}1"]) - zero) for name in STATE}
+        self._at = self._outer.at
         self._row = {name: part.start for name, part in self._at.items()}
         self._evaluations = self._jacobians = self._k = 0
         self._stop = 0.0
@@ -133,7 +114,7 @@ class CompiledAttempts:
         self._begun = h > 0
         self._near.clear()
 
-    def _set_parameters(self, arena: _Arena, which: Sequence[int]) -> None:
+    def _set_parameters(self, arena: Arena, which: Sequence[int]) -> None:
         if self._parameters.size:
             own = self._parameters[which].T if self._parameters.ndim == 2 else self._parameters[:, None]
             arena["parameters"][:] = own
@@ -265,10 +246,10 @@ class CompiledAttempts:
         if place in self._near:
             self._near[place].tighten(0, tolerances)
 
-    def _beside(self, place: int) -> _Arena:
+    def _beside(self, place: int) -> Arena:
         """Return room for other attempts of a lane's trajectory, in all lanes."""
         if self._inner is None:
-            self._inner = _Arena(self._code, Tolerances(0.0, _HUGE), 0.0)
+            self._inner = _arena(self._code, Tolerances(0.0, _HUGE), 0.0)
         self._set_parameters(self._inner, [self._which[place]] * self.width)
         self._inner["tau"][:] = self._outer["tau"][:, place, None]
         return self._inner

@@ -140,10 +140,10 @@ class _Compiled:
 
     def __init__(self, problem: IntegrationProblem, dyn: Dynamics, members: Indices, record: GridRecord) -> None:
         from mbkit.codegen.compiled import aligned
-        from mbkit.codegen.step_loop import compiled_step_loop, width
+        from mbkit.codegen.step_loop import Arena, compiled_step_loop
         from mbkit.derivation.steps.moreau import MANY, PATIENCE, STATE, moreau_parts
 
-        self._problem, self._record, self._i, self._state = problem, record, int(members[0]), STATE
+        self._problem, self._record, self._i = problem, record, int(members[0])
         friction, sliding = Friction(dyn), dyn._friction.sliding
         self._force, self._space = problem.torque.of_member(problem.member(self._i)), Space(dyn.model)
         none = np.zeros(dyn.model.nv)
@@ -155,21 +155,14 @@ class _Compiled:
             kept[problem.method] = compiled_step_loop(
                 (own._form, problem.method), lambda: moreau_parts(own.equations, which, sides, locks), STATE
             )
-        self._code = kept[problem.method]
-        self._room = aligned(self._code.size * width()).reshape(self._code.size, width())
-        self._room[:] = 0.0
-        self._ways, self._lanes = np.zeros(5, dtype=np.int64), width()
+        self._arena = arena = Arena(kept[problem.method], STATE)
         self._clock: int | None = None
-        self["bound"][:] = dyn._friction.law_of(dyn).bound[which, None]
-        if "parameters" in self._code.rows:
+        arena["bound"][:] = dyn._friction.law_of(dyn).bound[which, None]
+        if "parameters" in arena.code.rows:
             others = {name: x for name, x in names.items() if name not in {*sides, *locks}}
-            self["parameters"][:] = np.array([*others.values()], dtype=float)[:, None]
+            arena["parameters"][:] = np.array([*others.values()], dtype=float)[:, None]
             self._clock = [*others].index(own.model.time_parameter) if own.model.time_parameter else None
-        rows = self._code.rows
-        zero = rows[f"{STATE[0]}1"][0]
-        self._at = {name: slice(rows[f"{name}1"][0] - zero, sum(rows[f"{name}1"]) - zero) for name in STATE}
-        self._count = sum(rows[name][1] for name in STATE)
-        self._now = self._room[zero : zero + self._count]
+        self._now, self._at = arena.state, arena.at
         q, w = problem.q[self._i], self._space.to_integrator_velocity(problem.q[self._i], problem.v[self._i])
         self._put(q=q, w=w, best=MANY, left=PATIENCE, go=1.0)
         self._friction, self._which = friction, which
@@ -179,10 +172,6 @@ class _Compiled:
     def _put(self, **values: Array | float) -> None:
         for name, value in values.items():
             self._now[self._at[name]] = np.reshape(value, (-1, 1))
-
-    def __getitem__(self, name: str) -> Array:
-        first, count = self._code.rows[name]
-        return self._room[first : first + count]
 
     def run(self) -> tuple[int, int, str]:
         """Return the good steps, the attempts, and why there are not more steps."""
@@ -201,10 +190,10 @@ class _Compiled:
                 phase = self._friction.phase(grid.start, q, v, self._force(0))
                 self._put(side=phase.sides[self._which], still=phase.still[self._which].astype(float))
             last = k + 1 if held or k == grid.steps - 1 else grid.steps - (grid.step(grid.steps - 1) != grid.dt)
-            self["tau"][:] = np.asarray(self._force(k))[:, None]
-            self["dt"][:] = grid.step(k)
+            self._arena["tau"][:] = np.asarray(self._force(k))[:, None]
+            self._arena["dt"][:] = grid.step(k)
             if self._clock is not None:
-                self["parameters"][self._clock] = grid.time(k) - k * grid.step(k)
+                self._arena["parameters"][self._clock] = grid.time(k) - k * grid.step(k)
             since = 0
             while k < last and not why:
                 done, tried, since, why = self._advance(k, last, since)
@@ -215,10 +204,7 @@ class _Compiled:
         """Return the steps made, the attempts, those since the last step, and why there are not more."""
         self._now[self._at["end"]] = last
         self._now[self._at["go"]] = 1.0
-        self._ways[:] = self._now.ctypes.data, 0, self._log.ctypes.data, 0, 1
-        rounds = min(_ROUNDS, max(2, 2 * (last - k)))
-        self._code.loaded.run(self._room.ctypes.data, self._ways.ctypes.data, 0, rounds)
-        count = int(self._ways[3])
+        count = self._arena.run(self._now, self._log, min(_ROUNDS, max(2, 2 * (last - k))), on=True)
         states = self._log[:count, :, 0]
         reached = states[:, self._at["k"].start]
         good = np.flatnonzero(np.diff(np.append(float(k), reached)) > 0)
