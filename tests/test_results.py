@@ -15,11 +15,12 @@ from mbkit.errors import InputError, OutputError
 from mbkit.studies.baseline.description import Change
 from mbkit.studies.baseline.result import BaselineResult, ChangedNumber, VersionChange
 from mbkit.studies.compare.result import Comparison
-from mbkit.studies.document import Column, Items, Paragraph, Table, block_html, block_markdown, plain
+from mbkit.studies.document import Column, Items, Paragraph, Table, block_html, block_markdown, plain, to_html
 from mbkit.studies.explain.joint_matching import Match
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.terms import Gap
 from mbkit.studies.importers.result import Parsed, ParserComparison, Stage
+from mbkit.studies.lint.result import LintFinding, LintResult
 from mbkit.studies.results import Refusal, from_plain, to_plain
 from tests.test_report import AGREEING, DIFFERING, EMPTY, STUDY
 from tests.test_stress_report import RESULT
@@ -147,6 +148,18 @@ def test_markdown_and_html_escape_texts_and_write_numbers_as_asked():
     )
     for result in RESULTS.values():
         assert "<mesh>" not in result._repr_html_() + result.to_markdown()
+
+
+def test_markdown_has_every_difference_and_a_terminal_the_gravest():
+    changes = tuple(replace(CHECKED.changes[0], text=f"change {k}") for k in range(30))
+    moved = tuple(replace(CHECKED.moved[0], term=f"term {k}", error=1.0 / (k + 1)) for k in range(9))
+    many = replace(CHECKED, changes=changes, moved=moved)
+    for shown, (described, numbers) in ((many.to_markdown(), (30, 9)), (to_html(many.document(full=False)), (20, 5))):
+        assert (shown.count("description: change"), shown.count("off by")) == (described, numbers)
+    links = tuple(LintFinding(f"link{k}", "density", 1.0, "2", "likely", "too light") for k in range(9))
+    linted = LintResult("arm", links, 9, 8, 0)
+    for shown, named in ((linted.to_markdown(), 9), (to_html(linted.document(full=False)), 3)):
+        assert sum(f"link{k}" in shown for k in range(9)) == named
 
 
 @pytest.mark.parametrize("name", [*RESULTS, "study", "stress"])

@@ -131,7 +131,7 @@ def _check_one(
         result = baselines.check(model, file, strict=strict, target=new_target, progress=bar)
     if table:
         again = f"mbkit baseline check {file}{f' --target {target}' if target else ''} --rebaseline"
-        shared.show(result.document(again), as_json=False)
+        shared.show(result.document(again, full=False), as_json=False)
     if result.status in ("same", "skipped"):
         return result, False
     if not rebaseline and not (table and result.status == "versions" and _confirmed(file)):
@@ -175,7 +175,7 @@ def diff(path_a: Path, path_b: Path, as_json: bool) -> None:
     from mbkit.studies import baseline as baselines
 
     result = baselines.diff(path_a, path_b)
-    shared.show(result.document(), as_json=as_json)
+    shared.show(result.document(full=False), as_json=as_json)
     shared.leave(AGREE if result.passed else DIFFER)
 
 

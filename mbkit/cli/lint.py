@@ -30,5 +30,5 @@ def lint(target: str, control_period: float, no_shapes: bool, options: dict[str,
     from mbkit.studies.lint import lint as study
 
     result = study(target, control_period=control_period, shapes=not no_shapes, **options)
-    shared.show(result.document(), as_json=as_json)
+    shared.show(result.document(full=False), as_json=as_json)
     shared.leave(shared.AGREE if result.passed else shared.DIFFER)

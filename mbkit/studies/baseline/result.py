@@ -176,11 +176,11 @@ class BaselineResult(ResultTable):
     _listed = "moved"
     _csv_columns = columns_of(ChangedNumber)
 
-    def document(self, again: str = "") -> Document:
-        """Return the document of a check or a diff; `again` is the command that records again."""
+    def document(self, again: str = "", *, full: bool = True) -> Document:
+        """Return the document of a check or a diff; `again` is the command that records again, `full` as in `lines`."""
         skipped = {r.engine for r in self.skipped}
         bullets = []
-        for what, line in self.lines():
+        for what, line in self.lines(everything=full):
             mark, style = _SKIPPED if what in skipped else _MARKS.get(what, _FAULT)
             bullets.append(Bullet(what, line, mark, style))
         if again and self.question == "check" and self.status in ("description", "numbers", "versions"):

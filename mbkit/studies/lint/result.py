@@ -80,11 +80,12 @@ class LintResult(ResultTable):
             f": {how}" if how else ""
         )
 
-    def document(self) -> Document:
-        """Return the document of the findings; parts with the same finding share a line."""
+    def document(self, *, full: bool = True) -> Document:
+        """Return the document of the findings; parts with the same finding share a line, which names a few or all."""
+        most = len(self.rows) if full else _MAX_NAMES
         groups = by_key(((row.check, row.confidence, row.message, row.expected), row) for row in self.rows)
         columns = (
-            Column("link or joint", lambda rows: Span(listing([row.part for row in rows], _MAX_NAMES), "mono")),
+            Column("link or joint", lambda rows: Span(listing([row.part for row in rows], most), "mono")),
             Column("check", lambda rows: rows[0].check),
             Column("", lambda rows: Span(rows[0].confidence, _STYLES[rows[0].confidence])),
             Column("found", lambda rows: rows[0].message, fill=True),
