@@ -179,6 +179,23 @@ def test_a_four_bar_lets_go_where_the_virtual_work_passes_that_of_all_its_pins(
     assert np.abs(dyn.constraint_residual(run.q[-1])).max() < 1e-12
 
 
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+@pytest.mark.parametrize("quantity", ["constraint_forces", "generalized_constraint_force"])
+def test_forces_that_hold_pins_in_more_than_one_way_are_told_to_be_so(engine: str, quantity: str) -> None:
+    dyn, (q, v) = mb.dynamics(four_bar(), engine), started([1.0, 0.0, 0.0])
+    ask, (pin, none) = getattr(dyn, quantity), np.zeros((2, 3))
+    with pytest.warns(
+        MbkitWarning, match=rf"{quantity}: what holds crank, coupler, rocker .* 2 of 3 states, first in 1"
+    ):
+        every = ask(q, v, np.zeros((3, 3)))
+    with warnings.catch_warnings(action="error"):
+        assert np.abs(ask(q[0], v[0], none) - every[0]).max() < 1e-12
+        # One pin holds alone.
+        b = mb.ModelBuilder.of(dyn.model.without("friction"))
+        b.set_joint("crank", friction=50.0)
+        getattr(mb.dynamics(b.build(), engine), quantity)(q[1], pin, none)
+
+
 # Couplers, mimics, rolling contacts
 
 

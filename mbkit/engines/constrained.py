@@ -312,8 +312,7 @@ class Constrained(Evaluation):
         >>> dyn.constraint_forces(q, v, [0.0] * 3).shape, len(dyn.constraint_names)
         ((2,), 2)
         """
-        self._warn_if_inconsistent(q, v)
-        return self._evaluate("constraint_forces", q=q, v=v, tau=tau)
+        return self._reactions("constraint_forces", q, v, tau)
 
     def generalized_constraint_force(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
         """Return Jᵀ λ, the generalized force that keeps the constraints under τ; (nv,) or (N, nv).
@@ -326,8 +325,14 @@ class Constrained(Evaluation):
         >>> dyn.generalized_constraint_force(q, v, [0.0] * 3).shape
         (3,)
         """
+        return self._reactions("generalized_constraint_force", q, v, tau)
+
+    def _reactions(self, quantity: str, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
         self._warn_if_inconsistent(q, v)
-        return self._evaluate("generalized_constraint_force", q=q, v=v, tau=tau)
+        out = self._evaluate(quantity, q=q, v=v, tau=tau)
+        if "jump" in self.model.effects and self._projects:
+            self._friction.warn_of_shares(self, quantity, *(np.asarray(x) for x in (q, v, tau)))
+        return out
 
     def _generalized_constraint_force(self, q: Array, v: Array, tau: Array) -> Any:
         # Dry friction is in τ already.

@@ -63,6 +63,7 @@ class Evaluation:
     _centroidal_momentum: Callable[[Array, Array], Array]
     _joint_wrenches: Evaluate
     _row_choice: Any
+    _friction: Any
 
     @property
     def _samples(self) -> int | None:

@@ -26,7 +26,7 @@ from mbkit._warn import warn
 from mbkit.engines.elements.added_force import LOADS, UNDER_FORCE, AddedForce
 from mbkit.errors import MbkitWarning, NumericalError, UnsupportedError
 from mbkit.model import Model
-from mbkit.model.changes.dry_friction import ROUNDING, DryFrictionLaw, Sliding, friction_bindings
+from mbkit.model.changes.dry_friction import POSE_ROUNDING, ROUNDING, DryFrictionLaw, Sliding, friction_bindings
 from mbkit.model.parts import RESTING
 
 #: Mask of the velocities at rest.
@@ -231,6 +231,22 @@ class DryFriction(AddedForce):
 
             return loaded
         return moving
+
+    def warn_of_shares(self, dyn: Any, quantity: str, q: Array, v: Array, tau: Array) -> None:
+        """Warn where joints rest together in fewer ways than there are joints: what holds them is not unique."""
+        if not (resting := self.law_of(dyn).at_rest(v)).any():
+            return
+        still, N = np.atleast_2d(resting & (dyn.forward_dynamics(q, v, tau) == 0)), self.directions(dyn, q)
+        N = np.broadcast_to(N, (len(still), *N.shape[-2:]))
+        many = [k for k, r in enumerate(still) if np.linalg.matrix_rank(N[k][r], POSE_ROUNDING) < r.sum()]
+        if many:
+            names = ", ".join(self._model.velocity_names[i] for i in np.flatnonzero(still[many[0]]))
+            where = f" in {len(many)} of {len(still)} states, first in {many[0]}" if len(still) > 1 else ""
+            warn(
+                f"{self._model.name}: {quantity}: what holds {names} at rest is one solution of many{where}; "
+                "the motion is unique",
+                MbkitWarning,
+            )
 
     def _each(
         self,
