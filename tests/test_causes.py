@@ -379,6 +379,26 @@ def test_other_names_are_matched_by_structure_and_six_digits_are_told_as_roundin
     assert found.explained
 
 
+@pytest.mark.parametrize(("many", "apart", "rounding"), [(5, 1.5e-5, True), (5, 2.5e-5, False), (4, 1.5e-5, False)])
+def test_rounding_is_five_small_differences_at_least(many: int, apart: float, rounding: bool) -> None:
+    rods = [{"mass": 1.0, "com": (0.1, 0, 0.2), "inertia": (0.1, 0.2, 0.3), "axis": (0, 1, 0)} for _ in range(5)]
+    a = chain(*rods, name="rods").build()
+    b = replace(a, bodies=tuple(replace(x, mass=1 + apart) if k < many else x for k, x in enumerate(a.bodies)))
+    found = mb.explain(a, b, samples=1)
+    assert [c.kind for c in found.causes] == (["rounding"] if rounding else ["mass"] * many)
+    assert found.explained
+
+
+@pytest.mark.parametrize(("far", "same"), [(2e-6, True), (1.5e-5, False)])
+def test_a_state_keeps_constraints_to_the_digits_of_a_description(far: float, same: bool) -> None:
+    model = mb.catalog.four_bar()
+    (loop,) = model.loops
+    moved = replace(model, loops=(replace(loop, translation_b=loop.translation_b + np.array([far, 0, 0])),))
+    with warnings.catch_warnings(action="error"):
+        (cause,) = mb.explain(model, moved, samples=1).causes
+    assert np.isfinite(cause.effects["accelerations"]) == same
+
+
 def test_joints_that_only_one_side_has() -> None:
     a = robot("kinova")
     below = {"tool"}

@@ -14,7 +14,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit import spatial
 from mbkit._check import EPS, Array
 from mbkit.errors import MbkitError, MbkitWarning
 from mbkit.load import load
@@ -26,6 +25,7 @@ from mbkit.model.elements.formula import Formula
 from mbkit.model.elements.references import KINDS_OF_PARTS, called
 from mbkit.model.parts import ENTRIES, OF_Q, PointSpring, rules_of
 from mbkit.studies._targets import resolved, resolved_options
+from mbkit.studies.explain.mistakes import turn_of
 
 Part = dict[str, Any]
 #: Section -> part -> field -> number, text or list of numbers; a flat section has one part without name.
@@ -257,7 +257,7 @@ def _pair(old: float, new: float) -> str:
 
 def _turn(old: Array, new: Array) -> str:
     """Return by how much and about which of the old axes a frame has turned; empty for a turn within rounding."""
-    turned = spatial.log_quaternion(spatial.quaternion_from_matrix(old.reshape(3, 3).T @ new.reshape(3, 3)))
+    turned = turn_of(old.reshape(3, 3).T @ new.reshape(3, 3))
     angle = float(np.linalg.norm(turned))
     if angle < _LEAST_TURN_RAD:
         return ""

@@ -19,7 +19,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit import spatial
 from mbkit._check import EPS, Array, count
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.oracle import OracleDynamics
@@ -45,6 +44,7 @@ from mbkit.studies.baseline.file import FRAMES, ROLLOUT, Baseline, Rollout, path
 from mbkit.studies.baseline.result import BaselineResult, ChangedNumber, Status, VersionChange
 from mbkit.studies.compare.errors import Errors, Scales
 from mbkit.studies.compare.terms import TERMS, States, states
+from mbkit.studies.explain.mistakes import turn_of
 from mbkit.studies.results import Refusal
 from mbkit.studies.study_runs import quiet_simulate, require_motion
 
@@ -589,7 +589,7 @@ def _moved_frames(recorded: Baseline, model: Model) -> str:
         before, after = (_placed(side, name) for side in (old, new))
         if bodies.get(carried.get(before[0], ""), before[0]) != after[0]:
             far[name] = np.inf, np.inf
-        turn = spatial.log_quaternion(spatial.quaternion_from_matrix(before[2].T @ after[2]))
+        turn = turn_of(before[2].T @ after[2])
         moved = float(np.linalg.norm(after[1] - before[1])), float(np.linalg.norm(turn))
         if max(moved) > _FRAME_ROUNDING:
             far.setdefault(name, moved)

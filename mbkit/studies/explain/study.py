@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -10,7 +11,7 @@ import numpy as np
 
 from mbkit._check import count, real
 from mbkit.engines import Dynamics
-from mbkit.errors import InputError
+from mbkit.errors import InputError, MbkitWarning
 from mbkit.model import GravityCompensation, Model
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import Path
@@ -227,8 +228,11 @@ class _Descriptions:
 
     def _acceleration_gap(self, a: Model, b: Model) -> float:
         """Return the difference between the accelerations of two whole systems; NaN where nothing can be compared."""
-        same = a.velocity_names == b.velocity_names and a.nv
-        return terms.whole_gap(a, b, self.samples, self.seed) if same else np.nan
+        if a.velocity_names != b.velocity_names or not a.nv:
+            return np.nan
+        # A state of one may be off the other's constraints, which is what is asked.
+        with warnings.catch_warnings(action="ignore", category=MbkitWarning):
+            return terms.whole_gap(a, b, self.samples, self.seed)
 
     def _cause(self, h: Hypothesis, effects: dict[str, float]) -> Cause:
         acts = any(not x <= self.tolerance for x in effects.values())
@@ -240,7 +244,8 @@ class _Descriptions:
         effects: dict[str, float] = {}
         for model, changed in ((one, h.apply(one)), (target, h.revert(target))) if h.changes else ():
             if h.kind in CONSTRAINTS:
-                found = {WHOLE: float(np.nan_to_num(self._acceleration_gap(model.model, changed.model), nan=np.inf))}
+                apart = self._acceleration_gap(model.model, changed.model)
+                found = {WHOLE: np.inf if np.isnan(apart) else apart}
             else:
                 found = self._gaps(model.model, changed.model).effects
             effects |= {term: max(x, effects.get(term, 0.0)) for term, x in found.items()}

@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from importlib import metadata
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
@@ -448,9 +447,4 @@ def _remote(importers: Sequence[str | EngineVersion]) -> dict[str | EngineVersio
 
 
 def _version(engine: str) -> str:
-    if "==" in engine:
-        return engine.partition("==")[2]
-    try:
-        return metadata.version(IMPORTERS[engine].distribution)
-    except metadata.PackageNotFoundError:
-        return MISSING
+    return engine.partition("==")[2] or results.versions().get(IMPORTERS[engine].distribution, MISSING)
