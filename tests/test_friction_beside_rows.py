@@ -80,6 +80,7 @@ def crank_energies(theta: float) -> tuple[float, float]:
     return kinetic / 2, 9.81 * (crank * R / 2 * np.sin(theta) + coupler * (R * np.sin(theta) + L / 2 * np.sin(phi)))
 
 
+@pytest.mark.thorough(every=2)
 @pytest.mark.parametrize(("engine", "method", "most", "t0"), [
     ("lagrangian", "rk853", 1e-9, 0.0), ("lagrangian", "dop853", 1e-9, 0.0), ("lagrangian", "rodas5", 1e-8, 0.0),
     ("lagrangian", "rk4", 2e-7, 0.0), ("lagrangian", "gauss4", 2e-7, 0.0), ("pinocchio", "dop853", 1e-9, 0.0),
@@ -157,6 +158,7 @@ def four_bar_weight(theta: float) -> float:
     return float(four_bar_terms(theta + 1e-40j)[-1].imag / 1e-40)
 
 
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "compiled"])
 @pytest.mark.parametrize(("method", "more"), [
     ("rk853", ADAPTIVE), ("dop853", ADAPTIVE), ("rk4", {"dt": 0.01}), ("gauss4", {"dt": 0.01}),
@@ -212,6 +214,7 @@ def rotors(kind: str, ratio: float, friction: tuple[float, float], stiction: flo
     return b.build()
 
 
+@pytest.mark.thorough(every=2)
 @pytest.mark.parametrize("kind", ["geared", "mimic"])
 @pytest.mark.parametrize(("method", "more"), [("rk853", ADAPTIVE), ("rk4", {"dt": 0.01}), ("moreau", {"dt": 0.01})])
 def test_a_gear_comes_to_rest_and_is_pulled_loose_as_one_rotor(kind: str, method: str, more: dict[str, float]) -> None:
@@ -284,6 +287,7 @@ def slid(start: float, end: float, side: float) -> tuple[float, float]:
     return way + push * (end - start) ** 2 / 2, speed
 
 
+@pytest.mark.thorough(every=2)
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
 @pytest.mark.parametrize(("method", "more", "most"), [("rk853", ADAPTIVE, 1e-9), ("rk4", {"dt": 0.01}, 1e-7)])
 def test_a_block_on_a_shaken_table_sticks_and_slides(
@@ -331,6 +335,7 @@ def test_a_drive_that_leaves_no_freedom_turns_the_pins_with_it(method: str) -> N
     assert np.abs(v - at(0.55)[1]).max() < 1e-9
 
 
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize(("method", "more"), [
     ("rk853", {}), ("dop853", {}), ("rk4", {"dt": 2e-3}), ("rk4", {"dt": 1.9e-3}), ("gauss4", {"dt": 1.9e-2}),
 ])  # fmt: skip
@@ -430,6 +435,7 @@ def turned(model: Model, angle: float) -> np.ndarray:
     return np.array([-angle if j.name == "bar" else angle for j in model.joints])
 
 
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "compiled"])
 @pytest.mark.parametrize(("method", "more"), [("dop853", ADAPTIVE), ("rk4", {"dt": 2e-3}), ("gauss4", {"dt": 5e-3})])
 def test_a_parallelogram_of_three_cranks_rests_where_next_to_no_force_is_needed(
@@ -536,6 +542,7 @@ def test_a_five_bar_lets_go_where_no_share_of_its_pins_is_within_their_bounds(en
         assert np.abs(dyn.constraint_residual(run.q[-1])).max() < 1e-12
 
 
+@pytest.mark.thorough(every=2)
 @pytest.mark.parametrize("friction", [1e-10 * FIVE, np.array([1e-9, 1, 1, 1e-9, 1]), np.array([1, 1e-14, 1, 1, 1])])
 @pytest.mark.parametrize(("method", "more"), [("dop853", ADAPTIVE), ("rk4", {"dt": 0.01})])
 def test_a_five_bar_lets_go_as_its_bounds_say_whatever_their_sizes(
@@ -667,6 +674,7 @@ def test_the_turns_of_a_four_bar_with_stribeck_friction_are_those_of_34_digits()
     assert np.array(found, dtype=float) == pytest.approx(np.array(TURNS), rel=1e-14)
 
 
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize("method", ["rk853", "dop853", "rk4"])
 def test_stribeck_friction_in_a_four_bar_turns_and_stops_where_34_digits_say(method: str) -> None:
     dyn = mb.dynamics(curved(), "lagrangian")
@@ -685,6 +693,7 @@ def started(speeds: list[float]) -> tuple[np.ndarray, np.ndarray]:
     return np.array([q for q, _ in states]), np.array([x * slope for (_, slope), x in zip(states, speeds, strict=True)])
 
 
+@pytest.mark.thorough(every=2)
 @pytest.mark.parametrize(
     ("method", "engine"), [(x, "lagrangian") for x in ("rk4", "gauss4", "moreau")] + [("rk4", "compiled")]
 )

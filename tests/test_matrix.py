@@ -372,7 +372,7 @@ def test_a_kind_acts_alone_and_is_taken_out(name: str) -> None:
 OF_TYPES = [(name, path) for name in TYPES if name != "joint_type.beam" for path in CHECKS if path in ON_ENGINES]
 
 
-@pytest.mark.thorough(every=20)
+@pytest.mark.thorough(every=60)
 @pytest.mark.parametrize(("name", "path"), [*product(EXAMPLES, CHECKS), *OF_TYPES])
 def test_a_gate_refuses_a_kind_by_name_or_the_path_is_right(name: str, path: str, tmp_path: Path) -> None:
     gate, model = GATES[BELOW.get(path, path)], example(name)

@@ -90,7 +90,7 @@ CASES = [
 ERROR = {"bdf": 1e-7, "lsoda": 1e-7} | {name: 1e-6 for name in METHODS if name.startswith("drake")}
 
 
-@pytest.mark.thorough(every=7)
+@pytest.mark.thorough(every=20)
 @pytest.mark.parametrize(("name", "engine", "method"), CASES)
 def test_a_sampled_torque_is_that_of_runs_cut_at_the_samples(name, engine, method):
     """Each method asks once at each sample, of one state, of a batch and of a policy."""
@@ -365,6 +365,7 @@ def test_a_policy_may_write_into_what_it_is_given(hold):
     np.testing.assert_array_equal(written.q, plain.q)
 
 
+@pytest.mark.thorough(every=2)
 @pytest.mark.parametrize("engine", ["compiled", "lagrangian", "pinocchio"])
 @pytest.mark.parametrize("method", ["rk4", "moreau"])
 def test_dry_friction_of_many_is_that_of_runs_cut_at_the_samples(engine, method):
