@@ -311,6 +311,7 @@ def test_many_stiff_joints_do_not_fill_the_first_screen():
     text = " ".join(printed(check_table(replace(AGREEING, findings=found), full=False), 160).split())
     assert [f"j{k}: too fast" in text for k in range(9)] == [True] * 3 + [False] * 6
     assert "stiff joints: 6 more, less stiff: j3, j4, j5, j6, j7, j8" in text
+    assert all(f"j{k}: too fast" in replace(AGREEING, findings=found).to_markdown() for k in range(9))
 
 
 def test_every_term_of_the_table_has_a_line_on_the_page():

@@ -98,7 +98,7 @@ def _infinities(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[dict[s
 def from_plain(kind: Any, value: Any) -> Any:
     """Return plain data as a type: dataclasses, tuples, NaN for null in a number. Unknown entries are left out."""
     if is_dataclass(kind):
-        hints = typing.get_type_hints(kind)
+        hints = _type_hints(kind)
         names = [f.name for f in fields(kind) if f.name in value]
         return typing.cast(Any, kind)(**{name: from_plain(hints[name], value[name]) for name in names})
     if kind is float:
@@ -112,6 +112,10 @@ def from_plain(kind: Any, value: Any) -> Any:
     if origin in (types.UnionType, typing.Union) and value is not None:
         return from_plain(args[0], value)
     return value
+
+
+#: Type hints of a class: they resolve every annotation, and a result has hundreds of rows of one class.
+_type_hints: Final = cache(typing.get_type_hints)
 
 
 # Columns of CSV files: head -> value of a row.

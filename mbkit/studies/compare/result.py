@@ -288,12 +288,11 @@ class Comparison(ResultTable):
     def _first_screen(self, *, full: bool) -> list[doc.Block]:
         """Return what a reader needs to know before any table."""
         stiff = [x for x in self.findings if x.kind == STIFF]
-        beside = [doc.Bullet(x.kind, x.says, "!", "allowed") for x in self.findings if x not in stiff[_MAX_STIFF:]]
-        if len(stiff) > _MAX_STIFF:
-            rest = ", ".join(name for x in stiff[_MAX_STIFF:] for name in x.joints)
-            beside.append(
-                doc.Bullet("stiff joints", f"{len(stiff) - _MAX_STIFF} more, less stiff: {rest}", "!", "allowed")
-            )
+        less = [] if full else stiff[_MAX_STIFF:]
+        beside = [doc.Bullet(x.kind, x.says, "!", "allowed") for x in self.findings if x not in less]
+        if less:
+            rest = ", ".join(name for x in less for name in x.joints)
+            beside.append(doc.Bullet("stiff joints", f"{len(less)} more, less stiff: {rest}", "!", "allowed"))
         beside += [
             doc.Bullet(r.engine or f"no {r.term}", r.reason, "!", "allowed")
             for r in self.refusals
