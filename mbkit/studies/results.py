@@ -115,7 +115,7 @@ def from_plain(kind: Any, value: Any) -> Any:
 
 
 #: Type hints of a class: they resolve every annotation, and a result has hundreds of rows of one class.
-_type_hints: Final = cache(typing.get_type_hints)
+_type_hints: Final[Callable[[Any], dict[str, Any]]] = cache(typing.get_type_hints)
 
 
 # Columns of CSV files: head -> value of a row.
