@@ -18,7 +18,6 @@ import sympy as sp
 from mpmath.libmp import NoConvergence
 from numpy.random import default_rng
 from sympy.core.function import AppliedUndef
-from sympy.functions.elementary.trigonometric import TrigonometricFunction
 
 from mbkit.errors import UnsupportedError
 from mbkit.lagrangian.trig.polynomial import MAX_READABLE_TERMS, Key, TrigPolynomial, TrigRing, quotient
@@ -28,8 +27,6 @@ from mbkit.lagrangian.trig.shortest_form import MAX_COMBINED_TERMS, complexity, 
 MAX_SIMPLIFIED_OPERATIONS: Final = 2000
 #: Operations up to which an intermediate result is tidied.
 _MAX_TIDIED_OPERATIONS: Final = 150
-# Roots of cosines: their factors often read better as they were.
-_ROOT_COMPLEXITY_RATIO: Final = 0.7
 
 
 @lru_cache(1024)
@@ -40,12 +37,8 @@ def tidy(x: sp.Expr) -> sp.Expr:
     """
     if not x.free_symbols or x.count_ops() > MAX_SIMPLIFIED_OPERATIONS:
         return x
-    rooted = any(p.has(TrigonometricFunction) for p in x.atoms(sp.Pow) if not p.exp.is_Integer)
     # Among equally complex forms a combined one wins.
-    tried = [(complexity(form), form) for form in forms(x)] + [
-        (complexity(x) * (_ROOT_COMPLEXITY_RATIO if rooted else 1.0), x)
-    ]
-    return min(tried, key=lambda pair: pair[0])[1]
+    return min((*forms(x), x), key=complexity)
 
 
 def tidy_short(x: sp.Expr) -> sp.Expr:
