@@ -22,7 +22,7 @@ class Evaluation:
     _soft_friction: bool
     _state_unchecked: bool
     _step_unchecked: bool
-    # Of `Dynamics`: checks, batches and methods of adapters.
+    # Checks, batches and methods of adapters stand in `Dynamics`.
     at: Callable[..., Any]
     _evaluate: Callable[..., Array]
     _method: Callable[[str], Evaluate]
@@ -46,7 +46,7 @@ class Evaluation:
     velocity: Callable[..., Array]
     acceleration: Callable[..., Array]
     loop_wrenches: Callable[..., Array]
-    # Of adapters, at checked states.
+    # Adapters have these, at checked states.
     _mass_matrix: Callable[[Array], Array]
     _coriolis_matrix: Callable[[Array, Array], Any]
     _inverse_dynamics: Evaluate

@@ -394,7 +394,7 @@ class FrameByFrame:
     _place: Callable[..., Array]
     #: R_WF and p_WF of a frame, and what the engine needs to tell of that point.
     _placed: Callable[[Frame], tuple[Array, Array, Any]]
-    #: Of p_WF and the same: Jacobians of the point and of turning.
+    #: From p_WF and the same: Jacobians of the point and of turning.
     _point_jacobian: Callable[[Array, Any], tuple[Array, Array]]
     _columns: Callable[[Array], Array]
 
@@ -415,7 +415,7 @@ class MovingFrames(FrameByFrame):
 
     #: Put a state and its accelerations in, as if there were no forces.
     _move: Callable[[Array, Array, Array], None]
-    #: Of p_WF and the same as for Jacobians: velocity; acceleration of the point, of its ω too; J̇ v in the engine's
+    #: From p_WF and the same as for Jacobians: velocity; acceleration of the point, of its ω too; J̇ v in the engine's
     #: velocities.
     _twist: Callable[[Array, Any], Array]
     _point_acceleration: Callable[[Array, Any, Array], Array]

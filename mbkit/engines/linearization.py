@@ -72,7 +72,7 @@ class Linearization(NamedTuple):
     B: Array
     #: (v, v̇), the rate of the state itself, (2nv,) or (N, 2nv); zero at an equilibrium.
     f: Array
-    #: Of the same changes measured at this very state, which stays: y = (difference(q, q(t)), v(t) - v) follows
+    #: A for the same changes measured at this very state, which stays: y = (difference(q, q(t)), v(t) - v) follows
     #: ẏ = f + A_fixed y + B δτ. It differs from A at moving free and ball joints, which have half of -ad_v and -ω̂ here.
     A_fixed: Array
 

@@ -87,7 +87,7 @@ def _of_definite(A: Array, b: Array, bound: Array, on: Mask) -> tuple[Array, Arr
     forces = np.zeros((size, n))
     side, best, left = np.zeros((size, n)), np.full(size, n + 1), np.full(size, _MAX_ROUNDS_WITHOUT_PROGRESS)
     going = np.arange(size)
-    # What is undecided to rounding is at rest.
+    # A velocity that is undecided to rounding is at rest.
     noise = _noise(A, b, bound)
     for _ in range(100 * (n + 1) ** 2):
         own, here = A[going], side[going]
@@ -156,7 +156,7 @@ def friction_forces(
         first = falls & (power >= (1 - _POWER_TIE_RATIO) * power.max(axis=1, keepdims=True))
         lower[rows] = np.where(first & (side < 0), -less[rows], low)
         upper[rows] = np.where(first & (side > 0), less[rows], high)
-        # What is known to leave may be held by what the others do then.
+        # A joint that is known to leave may be held by what the others do then.
         free[rows] &= ~first.any(axis=1, keepdims=True)
         rows = rows[first.any(axis=1)]
     return forces, holds

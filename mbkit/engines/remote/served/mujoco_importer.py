@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _PARTS = ("body_", "jnt_", "dof_", "qpos", "eq_", "tendon_", "wrap_", "actuator_", "site_")
 _SIZES = ("nbody", "njnt", "nq", "nv", "neq", "nu", "ntendon")
 _OPTIONS = ("gravity", "wind", "density", "viscosity", "disableflags", "enableflags")
-#: What acts in smooth terms: the engine is to hold it, or to refuse it.
+#: Fields that act in smooth terms: the engine is to hold them, or to refuse them.
 _ACTING = (
     *("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat", "body_gravcomp"),
     *("jnt_axis", "jnt_pos", "jnt_stiffness", "jnt_stiffnesspoly", "jnt_actgravcomp", "dof_armature", "dof_damping"),

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from typing import Any
 
 _KINDS = {"REVOLUTE": "revolute", "PRISMATIC": "prismatic", "BALL": "ball", "FREE": "free", "FIXED": "fixed"}
-#: What its validation says of a body.
+#: Text of its validation about a body.
 _OF_BODY = re.compile(r"for body '([^']+)'")
 #: Newton's numbers of velocities, and the description's.
 _NUMBERS = {

@@ -70,7 +70,7 @@ class Engine:
         b = self._builder
         self._nv, self._masses = b.joint_dof_count, np.array(b.body_mass)
         self._coms = np.array([tuple(x) for x in b.body_com], float).reshape(-1, 3)
-        #: Of each free joint its first velocity, its first coordinate and its body.
+        #: First velocity, first coordinate and body of each free joint.
         self._free, self._world = [], np.eye(self._nv)
         for j in range(b.joint_count):
             if b.joint_type[j] == newton.JointType.FREE:
