@@ -11,8 +11,9 @@ import casadi as ca
 import mpmath
 import numpy as np
 import pytest
+import sympy as sp
 from numpy.polynomial import Polynomial
-from scipy.integrate import quad
+from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 
 import mbkit as mb
@@ -262,6 +263,54 @@ def test_a_cart_on_a_wheel_that_rolls_has_the_friction_of_its_axle() -> None:
         assert names(run) == ["x turns", "axle turns"]
         assert run.events[0].t == pytest.approx(stop, rel=1e-11)
         assert run.v[-1] == pytest.approx(rate * (1.0 - stop) * slope, rel=1e-10)
+
+
+def rolling(friction: np.ndarray) -> Any:
+    """Return a(q, v, sides, held) of a disc of 1 kg and 0.5 m that rolls, by Lagrange's equations on paper."""
+    Q, V = sp.symbols("x y z psi theta phi"), sp.symbols("u:6")
+    psi, theta = Q[3:5]
+    spins = sp.Rational(1, 16), sp.Rational(1, 8)
+    turns = (V[4] ** 2 + (V[3] * sp.cos(theta)) ** 2) * spins[0] + (V[5] + V[3] * sp.sin(theta)) ** 2 * spins[1]
+    L = (V[0] ** 2 + V[1] ** 2 + V[2] ** 2 + turns) / 2 - sp.Rational(981, 100) * Q[2]
+    momenta = sp.Matrix([L.diff(u) for u in V])
+    h = momenta.jacobian(Q) * sp.Matrix(V) - sp.Matrix([L.diff(x) for x in Q])
+    yaw, lean = sp.rot_axis3(-psi), sp.rot_axis1(-theta)
+    omega = yaw * (sp.Matrix([V[4], 0, V[3]]) + lean * sp.Matrix([0, V[5], 0]))
+    # Beyond a right angle the lowest point is on the side that is up at first.
+    slip = sp.Matrix(V[:3]) + omega.cross(yaw * lean * sp.Matrix([0, 0, sp.Rational(1, 2)]))
+    rows = slip.jacobian(V)
+    terms = sp.lambdify((Q, V), (momenta.jacobian(V), h, rows, slip.jacobian(Q) * sp.Matrix(V)), "numpy", cse=True)
+
+    def accelerations(q: np.ndarray, v: np.ndarray, sides: np.ndarray, held: list[int]) -> np.ndarray:
+        M, force, J, gamma = (np.array(x, dtype=float) for x in terms(q, v))
+        J, none = np.vstack([J, np.eye(6)[held]]), np.zeros((3 + len(held), 3 + len(held)))
+        right = np.concatenate([-force[:, 0] - friction * sides, -gamma[:, 0], np.zeros(len(held))])
+        return np.linalg.solve(np.block([[M, J.T], [J, none]]), right)
+
+    return accelerations
+
+
+def test_a_disc_that_falls_flat_does_so_as_on_paper_and_ends_by_name() -> None:
+    dyn, q, v = rubbing("rolling_disc", 0, compile=True)
+    bounds, friction = ([float(getattr(j, x)[0]) for j in dyn.model.joints] for x in ("stiction", "friction"))
+    accelerations, y, t, sides = rolling(np.array(friction)), np.concatenate([q, v]), 0.0, np.sign(v)
+    found, held, names_of = [], list[int](), dyn.model.velocity_names
+    for which, end in ((3, 0.2), (1, 0.2), (3, 0.2), (5, 0.2), (None, 0.149)):
+        stops = lambda _, y, k=which: 1.0 if k is None else sides[k] * y[6 + k]  # noqa: E731
+        stops.terminal, stops.direction = True, -1  # type: ignore[attr-defined]
+        rates = lambda _, y, at=held: np.concatenate([y[6:], accelerations(y[:6], y[6:], sides, at)[:6]])  # noqa: E731
+        path = solve_ivp(rates, (t, end), y, "DOP853", rtol=1e-12, atol=1e-13, events=stops)
+        t, y = path.t[-1], path.y[:, -1]
+        if which is not None:
+            found.append((f"{names_of[which]} {'stops' if which == 5 else 'turns'}", pytest.approx(t, rel=1e-10)))
+            y[6 + which], sides[which], held = 0.0, -sides[which] * (which != 5), [5] * (which == 5)
+    assert abs(accelerations(y[:6], y[6:], sides, held)[-1]) < bounds[5]
+    run = simulated(dyn, q, v, 0.149, "rk853", **ADAPTIVE)
+    assert [(e.name, e.t) for e in run.events] == found
+    assert np.abs(np.concatenate([run.q[-1], run.v[-1]]) - y).max() < 1e-10
+    with pytest.warns(MbkitWarning, match=r"after t = 0.1496.* 'yaw' and 'spin'"):
+        flat = mb.simulate(dyn, q, v, 0.3, "rk853")
+    assert abs(flat.q[-1, 4] - np.pi / 2) < 1e-3
 
 
 # Prescribed motions
