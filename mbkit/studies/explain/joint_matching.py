@@ -181,17 +181,13 @@ def align_frames(b: MergedModel, a: Model, near: Tolerances) -> tuple[MergedMode
     slide to the other's place, and its centre of mass and the next joint then have numbers that are in neither file.
     """
     joints = {j.name: j for j in a.joints}
-    matter = {x.name: x for x in a.bodies}
-    own = {x.name: x for x in b.model.bodies}
     places = {"world": at_itself("world")}
     out: dict[str, tuple[Joint, Body]] = {}
     moved = []
     for joint in b.model.tree:
-        there = hung_on(joint, places, [])
-        body = own[joint.child]
+        there, body, like = hung_on(joint, places, []), b.model.body(joint.child), joints.get(joint.name)
         places[joint.child] = at_itself(joint.child)
         out[joint.name] = there, body
-        like = joints.get(joint.name)
         if like is None or not joint.type.axial or like.type.motion != joint.type.motion:
             continue
         turn, shift = there.rotation.T @ like.rotation, there.rotation.T @ (like.translation - there.translation)
@@ -202,16 +198,16 @@ def align_frames(b: MergedModel, a: Model, near: Tolerances) -> tuple[MergedMode
             shift = joint.axes[0] * (joint.axes[0] @ shift)
         if not shift.any() and np.array_equal(turn, np.eye(3)):
             continue
-        change = joint.child, turn.T, -turn.T @ shift
-        other = _moved(there, body, turn, shift)
-        after = _differing(*other, like, matter[like.child], near)
-        gain = _differing(there, body, like, matter[like.child], near) - after
-        for child in b.model.joints:
-            if child.parent == joint.child and child.name in joints:
-                places_there = (child, hung_on(child, {joint.child: change}, []))
-                own_faults, faults = (len(near.differing(x, joints[child.name], *_FRAMES)) for x in places_there)
-                gain += own_faults - faults
-        if gain > 0 and (gain > 1 or not after):
+        other, change = _moved(there, body, turn, shift), (joint.child, turn.T, -turn.T @ shift)
+        carried = [c for c in b.model.joints if c.parent == joint.child and c.name in joints]
+        own, beyond = [], []
+        for (placed, matter), place in (((there, body), at_itself(joint.child)), (other, change)):
+            unlike = near.differing(matter, a.body(like.child), "com", "inertia")
+            own.append(len(near.differing(placed, like, *_FRAMES, "axes")) + len(unlike))
+            hung = (hung_on(c, {joint.child: place}, []) for c in carried)
+            beyond.append(sum(len(near.differing(c, joints[c.name], *_FRAMES)) for c in hung))
+        gain = own[0] - own[1] + beyond[0] - beyond[1]
+        if gain > 1 or (gain == 1 and not own[1]):
             out[joint.name] = other
             places[joint.child] = change
             moved.append(joint.name)
@@ -235,10 +231,6 @@ def _moved(joint: Joint, body: Body, R: Array, p: Array) -> tuple[Joint, Body]:
     com = R.T @ (body.com - p) if body.mass else body.com
     inertia = R.T @ body.inertia @ R
     return placed, Body(body.name, body.mass, com, 0.5 * (inertia + inertia.T))
-
-
-def _differing(joint: Joint, body: Body, like: Joint, matter: Body, near: Tolerances) -> int:
-    return len(near.differing(joint, like, *_FRAMES, "axes")) + len(near.differing(body, matter, "com", "inertia"))
 
 
 # Joints that only one of the descriptions has.
