@@ -174,7 +174,7 @@ def run_implicit(
     """
     dyn, record, grid = problem.dyn, GridRecord(problem), problem.grid
     assert isinstance(dyn, LagrangianDynamics)
-    values = dyn._parameter_values
+    values, workers = dyn._parameter_values, min(dyn.threads or cores(), max(-(-len(other) // WIDEST), 1))
     # Threads append to it, and write their own members.
     iterations, lost = list[int](), dict[int, list[Array]]()
 
@@ -185,7 +185,7 @@ def run_implicit(
         return chunk
 
     run_members(
-        *(problem, record, np.arange(len(other)), WIDEST, dyn.threads or cores(), lambda _: begin, velocity),
+        *(problem, record, np.arange(len(other)), WIDEST, workers, lambda _: begin, velocity),
         after_block=lambda _chunk, _members, _k, last: lost.update(last),
         after_part=lambda chunk, _part: iterations.append(chunk.iterations),
     )
