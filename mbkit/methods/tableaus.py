@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from itertools import combinations_with_replacement
-from math import fsum, sqrt
+from math import fsum, prod, sqrt
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -102,6 +103,11 @@ def _times(rows: Array) -> Array:
     sums = np.array([fsum(row) for row in rows])
     # No stage lies behind the end of the step by a rounding.
     return np.where(np.abs(sums - 1.0) < _MAX_TIME_ROUNDING, 1.0, sums)
+
+
+def extrapolation_weights(times: Sequence[float], at: Iterable[float]) -> Array:
+    """Return the weights of values at some times in the values of their polynomial at others, one row for each."""
+    return np.array([[prod((x - b) / (a - b) for b in times if b != a) for a in times] for x in at])
 
 
 def _digest(*arrays: Array) -> str:

@@ -16,7 +16,6 @@ Where a step is not solved, or is near a singular pose, it counts as missed: Pyt
 from __future__ import annotations
 
 from functools import cached_property
-from math import prod
 from typing import Any, Final
 
 import casadi as ca
@@ -25,11 +24,11 @@ from mbkit._check import Array
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.mass_matrix_solve import elimination_size
 from mbkit.derivation.steps.fixed import Part, at_time, function_of
-from mbkit.derivation.steps.midpoint import LEAST, SMALL, is_lost
+from mbkit.derivation.steps.midpoint import MAX_LAST_CORRECTION, MAX_LAST_MOVE, is_lost
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, thorough_projection
 from mbkit.derivation.steps.rosenbrock import Factors
 from mbkit.derivation.steps.symbols import SymbolicSpace, choose
-from mbkit.methods.tableaus import ImplicitTableau
+from mbkit.methods.tableaus import ImplicitTableau, extrapolation_weights
 
 #: Number of steps through whose stages the first guess of the next ones is continued.
 _PAST_STEPS: Final = 2
@@ -226,8 +225,9 @@ class Collocation:
     def _is_rest(self, square: Any, x: Any) -> Any:
         """Return 1 where a correction of this square was the last one needed: what is left after it is its square."""
         s, h = self._symbols, self._symbols["dt"]
+        speed = ca.sumsqr(s["w"]) + self._square(x)
         # A NaN is not below anything.
-        return square < SMALL**2 * (ca.sumsqr(s["w"]) + self._square(x)) + (LEAST / h) ** 2 * (1 + ca.sumsqr(s["q"]))
+        return square < MAX_LAST_CORRECTION**2 * speed + (MAX_LAST_MOVE / h) ** 2 * (1 + ca.sumsqr(s["q"]))
 
     # The ends of a step
 
@@ -257,10 +257,7 @@ class Collocation:
                 if not any(abs(time - other) < _MAX_TIME_ROUNDING for other in times):
                     times.append(time)
                     values.append(x)
-        guesses = []
-        for at in c:
-            weights = [prod((at - b) / (a - b) for b in times if b != a) for a in times]
-            guesses.append(_sum(weights, values))
+        guesses = [_sum(weights, values) for weights in extrapolation_weights(times, c)]
         return ca.vertcat(*guesses, ca.SX(_JUDGEMENTS, 1))
 
     def _start(self) -> ca.Function:

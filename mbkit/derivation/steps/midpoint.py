@@ -37,17 +37,15 @@ from mbkit.derivation.steps.rosenbrock import Factors
 from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.model import quaternions
 
-#: Weights of the velocities of the last steps in the first guess of the next one: the
-#: parabola through them, continued.
-GUESS: Final = (3.0, -3.0, 1.0)
-#: A correction below SMALL of the velocity, or one that moves the configuration by less
-#: than LEAST (rad, m, or this part of the coordinates), was the last one needed: what
-#: Newton's iteration leaves behind is its square.
-SMALL: Final = 1e-8
-LEAST: Final = 1e-12
-#: Newton's iterations of a step, at most: what has not converged by then wanders about.
-MOST: Final = 12
-# A state beyond 1e100 counts as diverged.
+#: Weights of the velocities of the last steps in the first guess of the next one, with which their parabola goes on.
+GUESS_WEIGHTS: Final = (3.0, -3.0, 1.0)
+#: Largest correction that is the last one needed, relative to the velocity: Newton's iteration leaves its square.
+MAX_LAST_CORRECTION: Final = 1e-8
+#: Largest move of the configuration that is the last one needed, rad, m, or relative to the coordinates.
+MAX_LAST_MOVE: Final = 1e-12
+#: Most iterations of Newton's method in a step: one that has not converged by then wanders about.
+MAX_NEWTON_ITERATIONS: Final = 12
+#: Sum of squares of a state that counts as diverged, 1e100 squared.
 _RUNAWAY: Final = 1e200
 
 
@@ -204,7 +202,7 @@ class Midpoint:
         return q1, pi1, self._guess(), s["misses"] + s["miss"] + is_lost(q1, pi1)
 
     def _guess(self) -> Any:
-        return sum(weight * self._s[n] for weight, n in zip(GUESS, self.past, strict=True))
+        return sum(weight * self._s[n] for weight, n in zip(GUESS_WEIGHTS, self.past, strict=True))
 
     def _momentum(self) -> tuple[Any]:
         eq, s = self._equations, self._s
@@ -246,7 +244,7 @@ class Midpoint:
 def is_last(change: Any, w: Any, q: Any, h: Any) -> Any:
     """Return 1 where a correction of w was the last one needed, else 0."""
     # A NaN is not below anything.
-    return ca.sumsqr(change) < SMALL**2 * ca.sumsqr(w) + (LEAST / h) ** 2 * (1 + ca.sumsqr(q))
+    return ca.sumsqr(change) < MAX_LAST_CORRECTION**2 * ca.sumsqr(w) + (MAX_LAST_MOVE / h) ** 2 * (1 + ca.sumsqr(q))
 
 
 def is_lost(q: Any, pi: Any) -> Any:

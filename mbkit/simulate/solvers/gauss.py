@@ -7,7 +7,6 @@ on (q, v) as here.
 
 from __future__ import annotations
 
-from itertools import product
 from math import sqrt
 from typing import Final, NamedTuple
 
@@ -15,23 +14,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import EPS, Array
-from mbkit.methods.tableaus import ImplicitTableau
+from mbkit.methods.tableaus import ImplicitTableau, extrapolation_weights
 from mbkit.model.integration_space import Space
 from mbkit.simulate.singular_poses import LOOSEST
 from mbkit.simulate.solvers.vector_field import DIVERGED, DivergenceError, Field
 from mbkit.simulate.torque import Force
 
-_MOST: Final = 60
-_MOST_NEWTON: Final = 25
-# Where a correction is not this much smaller than the last one, plain iteration gives
-# way to Newton's, and Newton's matrix to a new one.
-_SLOW: Final = 0.05
-# Corrections that have stopped shrinking are rounding below this part of the velocity,
-# or where they move the configuration by less than this, in rad or m.
-_ROUNDING: Final = 1e-11
-_LEAST: Final = 1e-13
-#: Of a step: times that differ by less are one.
-_SAME_TIME: Final = 1e-9
+#: Most iterations of a step with one matrix at most, and with the matrix of every iterate.
+_MAX_ITERATIONS: Final = 60
+_MAX_NEWTON_ITERATIONS: Final = 25
+#: Largest ratio of a correction to the last one with which an iteration goes on. Beyond it plain iteration gives way to
+#: Newton's, and Newton's matrix to a new one.
+_MAX_CONTRACTION: Final = 0.05
+#: Largest correction that is rounding where corrections have stopped shrinking, relative to the velocity, and the
+#: largest such move of the configuration, rad or m.
+_MAX_VELOCITY_ROUNDING: Final = 1e-11
+_MAX_MOVE_ROUNDING: Final = 1e-13
+#: Largest difference of two times that are one, in steps.
+_MAX_TIME_ROUNDING: Final = 1e-9
 _UNSOLVED: Final = "the iteration does not solve the equations of the step's stages"
 
 
@@ -70,7 +70,8 @@ class CollocationStep:
     def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
         """Return q and w after a step of h seconds."""
         start = _Start(t, h, q, w, force)
-        past = next((x for x in self._past if abs(x.end - t) < _SAME_TIME * h and x.rates.shape[1:] == w.shape), None)
+        near = (x for x in self._past if abs(x.end - t) < _MAX_TIME_ROUNDING * h)
+        past = next((x for x in near if x.rates.shape[1:] == w.shape), None)
         rates, inverse = self._solved(start, self._guess(start, past), past.inverse if past and past.h == h else None)
         moved = _mixed(h * self._b, rates)
         q1 = self._space.retract(q, moved[..., : self._nv])
@@ -78,23 +79,16 @@ class CollocationStep:
         return q1, w + moved[..., self._nv :]
 
     def _guess(self, start: _Start, past: _Past | None) -> Array:
-        # The polynomial through the last step's ẇ, continued; of a first step the ẇ at its start.
+        # The polynomial through the last step's ẇ is continued; a first step has the ẇ at its start.
         nv, w = self._nv, start.w
         rates = np.zeros((self._s, *w.shape[:-1], 2 * nv))
         if past is not None:
-            rates[..., nv:] = _mixed(self._continued(start.h / past.h), past.rates)
+            weights = extrapolation_weights(self._times, 1 + start.h / past.h * self._c)
+            rates[..., nv:] = _mixed(weights, past.rates)
         else:
             rates[..., nv:] = self._field(start.t, start.q, w, start.force)
         rates[..., :nv] = w + _mixed(start.h * self._A, rates[..., nv:])
         return rates
-
-    def _continued(self, ratio: float) -> Array:
-        c, s = self._c, self._s
-        out = np.ones((s, s))
-        for i, j, k in product(range(s), repeat=3):
-            if k != j:
-                out[i, j] *= (1 + ratio * c[i] - c[k]) / (c[j] - c[k])
-        return out
 
     def _solved(self, start: _Start, guess: Array, inverse: Array | None) -> tuple[Array, Array | None]:
         """Return the rates, and Newton's matrix if plain iteration was too slow.
@@ -114,7 +108,7 @@ class CollocationStep:
     def _iterated(self, start: _Start, guess: Array, inverse: Array | None) -> tuple[Array, Array | None]:
         unknown = np.full(start.w.shape[:-1], np.inf)
         rates, last, fresh = guess, unknown, False
-        for _ in range(_MOST):
+        for _ in range(_MAX_ITERATIONS):
             try:
                 change = self._mapped(start, rates) - rates
             except DivergenceError:
@@ -140,7 +134,7 @@ class CollocationStep:
     def _newton(self, start: _Start, rates: Array) -> Array | None:
         """Return the rates by Newton's method proper; None where that leads nowhere."""
         last = np.full(start.w.shape[:-1], np.inf)
-        for _ in range(_MOST_NEWTON):
+        for _ in range(_MAX_NEWTON_ITERATIONS):
             try:
                 change = self._mapped(start, rates) - rates
                 stages = zip(self._times, *self._stages(start, rates), strict=True)
@@ -166,12 +160,9 @@ class CollocationStep:
             factor = size / last
             rest = size * factor / (1 - factor)
         done = (size <= EPS * speed) | (measurable & (factor < 1) & (rest <= EPS / 4 * speed))
-        done |= (
-            measurable
-            & (factor > 0.5)
-            & ((size <= (LOOSEST if self._field.near else _ROUNDING) * speed) | (start.h * size <= _LEAST))
-        )
-        return done, measurable & ~(factor < _SLOW)
+        least = LOOSEST if self._field.near else _MAX_VELOCITY_ROUNDING
+        done |= measurable & (factor > 0.5) & ((size <= least * speed) | (start.h * size <= _MAX_MOVE_ROUNDING))
+        return done, measurable & ~(factor < _MAX_CONTRACTION)
 
     def _size(self, h: float, rates: Array) -> Array:
         """Return, per state, the largest velocity among u̇ and h ẇ of all stages."""

@@ -17,7 +17,13 @@ from mbkit.codegen.interpreter import Machine
 from mbkit.derivation.mass_matrix_solve import factors_written_out
 from mbkit.derivation.steps.constrained_midpoint import ConstrainedMidpoint
 from mbkit.derivation.steps.fixed import Part
-from mbkit.derivation.steps.midpoint import GUESS, LEAST, MOST, SMALL, Midpoint
+from mbkit.derivation.steps.midpoint import (
+    GUESS_WEIGHTS,
+    MAX_LAST_CORRECTION,
+    MAX_LAST_MOVE,
+    MAX_NEWTON_ITERATIONS,
+    Midpoint,
+)
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.methods.registry import IMPLICIT_METHODS
 from mbkit.model.elements.paths import ALL, Path
@@ -135,7 +141,7 @@ class MidpointStepper(Stepper):
         self._single = problem.batch is None
         self._members: Indices = np.arange(len(w0))
         # The velocities of the last steps, and the first guess of the next one.
-        self._last, self._guess = [w0] * len(GUESS), w0
+        self._last, self._guess = [w0] * len(GUESS_WEIGHTS), w0
         self.iterations = 0
 
     def only(self, members: Indices, good: NDArray[np.bool_] | None = None) -> None:
@@ -170,7 +176,7 @@ class MidpointStepper(Stepper):
         if isinstance(force, np.ndarray):
             tau[:] = force
         last, todo = np.full(len(q), np.inf), np.arange(len(q))
-        for _ in range(MOST if isinstance(force, np.ndarray) else _MAX_ITERATIONS_WITH_FUNCTION):
+        for _ in range(MAX_NEWTON_ITERATIONS if isinstance(force, np.ndarray) else _MAX_ITERATIONS_WITH_FUNCTION):
             # Never call the user's function with a non-finite state.
             todo = todo[np.isfinite(w[todo]).all(axis=1) & ~good[todo]]
             if not len(todo):
@@ -198,7 +204,7 @@ class MidpointStepper(Stepper):
         residual, jacobian = called(self._dyn, self._midpoint.system, members, t, *args)
         change = _solved(jacobian, residual)
         w1 = w - change
-        limit = SMALL**2 * np.sum(w1**2, axis=1) + (LEAST / h) ** 2 * (1 + np.sum(q**2, axis=1))
+        limit = MAX_LAST_CORRECTION**2 * np.sum(w1**2, axis=1) + (MAX_LAST_MOVE / h) ** 2 * (1 + np.sum(q**2, axis=1))
         return w1, np.sum(change**2, axis=1) < limit
 
 

@@ -16,7 +16,7 @@ from mbkit.codegen.compiled import KernelSequence
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation.steps.collocation import Collocation
 from mbkit.derivation.steps.fixed import Part
-from mbkit.derivation.steps.midpoint import MOST
+from mbkit.derivation.steps.midpoint import MAX_NEWTON_ITERATIONS
 from mbkit.engines.base import at_time
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.methods.tableaus import ImplicitTableau
@@ -129,14 +129,14 @@ class ImplicitChunk(BlockLoop):
                 self._smooth += 1
                 break
             self._smooth = 0
-            if iterations == MOST:
+            if iterations == MAX_NEWTON_ITERATIONS:
                 break
-            iterations = min(iterations + max(iterations // 2, 1), MOST)
+            iterations = min(iterations + max(iterations // 2, 1), MAX_NEWTON_ITERATIONS)
         self._iterations, self._taken = iterations, step
         if missed.any():
             # Trajectories that are lost ask for no more iterations.
             self._alive &= ~missed
-            if self._iterations == MOST:
+            if self._iterations == MAX_NEWTON_ITERATIONS:
                 self._iterations = 2
 
     @property
