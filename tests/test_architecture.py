@@ -206,3 +206,13 @@ def test_validation_scripts_import_names_that_exist():
                     if not module or not (hasattr(import_module(module), name) or find_spec(f"{module}.{name}")):
                         missing.append(f"{path.name}: {node.module}.{name}")
     assert not missing
+
+
+def test_the_result_of_a_run_is_made_in_one_place():
+    calls = [
+        name
+        for name, path in FILES.items()
+        for node in nodes(path)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "SolverResult"
+    ]
+    assert calls == ["simulate/solvers/trajectory_record.py"]
