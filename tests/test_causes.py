@@ -633,6 +633,20 @@ def test_an_inertia_along_another_axis_is_no_misread_quaternion() -> None:
         assert " for [" in cause.says
 
 
+def test_products_of_inertia_of_the_other_sign_are_named() -> None:
+    I = np.array([[0.3, 0.02, 0.03], [0.02, 0.4, 0.01], [0.03, 0.01, 0.35]])
+    model, diagonal = hinge(com=(0.1, 0, 0), inertia=I, axis=(1, 1, 1)).build(), np.diag(np.diag(I))
+    one = np.where([[0, 1, 0], [1, 0, 0], [0, 0, 0]], -I, I)
+    for wrong, says in (
+        (2 * diagonal - I, "has the products of inertia with the other sign"),
+        (diagonal, "has no products of inertia"),
+        (one, "has Ixy with the other sign"),
+    ):
+        (cause,) = mb.explain(model, with_body(model, "a", inertia=wrong)).causes
+        assert cause.kind == "products of inertia"
+        assert says in cause.says
+
+
 def test_a_joint_that_the_other_side_has_not_is_not_held_still() -> None:
     link = {"com": (0, 0, -0.2), "inertia": (1e-2, 1e-2, 1e-3), "axis": (0, 1, 0)}
     links = [link | {"mass": 1.0 - 0.3 * k, "translation": (0, 0, -0.4 * k)} for k in range(3)]
