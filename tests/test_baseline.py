@@ -489,8 +489,11 @@ def test_diff_tells_parameters_numbers_and_versions_and_computes_nothing(monkeyp
     assert data["changes"][0]["new"] == 2.31
     for text in (result.to_markdown(), result._repr_html_(), result.text()):
         assert "2.3 → 2.31" in text
-    mb.baseline.record(mb.load(arm), other, PAIR[:1], seed=1)
-    assert "the states are others" in mb.baseline.diff(recorded, other).notes[0]
+    arm.write_text(ARM)
+    mb.baseline.record(mb.load(arm), other, PAIR[:1], seed=1, target="./arm.urdf")
+    result = mb.baseline.diff(recorded, other)
+    assert "the states are others" in result.notes[0]
+    assert result.status == "numbers"
     mb.baseline.record(mb.catalog.pendulum(), other, PAIR[:1], force=True)
     with pytest.raises(BaselineError, match="no joint in common"):
         mb.baseline.diff(recorded, other)
