@@ -24,6 +24,7 @@ from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.pinocchio.engine import PinocchioDynamics
 from mbkit.errors import BaselineError, InputError, NonPhysicalWarning, OutputError, UnknownNameError, UnsupportedError
 from mbkit.studies import results
+from mbkit.studies.baseline.description import changes, described
 from mbkit.studies.baseline.file import store, text_of
 
 RECORDED = Path(__file__).parent / "baselines"
@@ -254,6 +255,12 @@ def test_rounding_of_another_parser_is_no_edit(monkeypatch, tmp_path):
     result = mb.baseline.check(rounded, path)
     assert result.status == "versions"
     assert any("only rounding: mass of body a" in note for note in result.notes)
+    # Of a place zero is no size.
+    first, *others = scene().joints
+    placed = [
+        described(replace(scene(), joints=(replace(first, translation=(x, 0, 0)), *others))) for x in (0, 1e-17, 1e-9)
+    ]
+    assert [changes(placed[0], x)[0].rounding for x in placed[1:]] == [True, False]
 
 
 # Numbers and versions.
