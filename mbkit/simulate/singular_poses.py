@@ -39,6 +39,8 @@ _ON_BRANCH: Final = 1e-5
 _APART: Final = 1e-4
 #: Where a step of rk853 has the pose: in the middle of the widest gap between its stages, 1/3 and 0.6.
 _BETWEEN: Final = 7 / 15
+#: Of a step of rk853: how far from a pose it ends at least.
+_CLOSE: Final = 0.45
 
 
 def manifold_at(dyn: Dynamics, t: float) -> Manifold:
@@ -208,10 +210,14 @@ class Approach:
     def length(self, h: float) -> float:
         """Return the length, up to h, of the next step of rk853 with which no stage comes close to a pose ahead."""
         d = float(self.ahead)
-        if not 0.02 * h < d < 1.45 * h:
+        if not 0.02 * h < d < (1 + _CLOSE) * h:
             return h
         # A little longer is better than a short step before it.
-        return d / _BETWEEN if d <= 1.05 * _BETWEEN * h else min(h, d - 0.45 * h)
+        return d / _BETWEEN if d <= 1.05 * _BETWEEN * h else min(h, d - _CLOSE * h)
+
+    def ends_close(self, h: float) -> bool:
+        """Return whether a step of rk853 of this length would end close to a pose."""
+        return bool(abs(float(self.ahead) - h) < _CLOSE * h)
 
 
 def _time_ahead(dyn: Dynamics, t: float, q: Array, v: Array) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +13,12 @@ from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError
 from mbkit.methods.one_step import ArrayStages, SemiImplicitEuler
 from mbkit.methods.registry import method_of
-from mbkit.methods.tableaus import ImplicitTableau, Tableau, gauss_legendre
+from mbkit.methods.tableaus import ImplicitTableau, Tableau
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.singular_poses import SingularPosesOfBatch, manifold_at
-from mbkit.simulate.solvers.gauss import CollocationStep
+from mbkit.simulate.singular_poses import LOOSEST, SingularPosesOfBatch, manifold_at
+from mbkit.simulate.solvers.gauss import CollocationStep, StepNearPose
 from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.solvers.vector_field import ALL, DIVERGED, DivergenceError, Field, are_bounded
 from mbkit.simulate.time_grid import Indices
@@ -26,10 +26,6 @@ from mbkit.simulate.torque import Force
 
 #: step(t, h, q, w, force) -> (q, w) at t + h; one state or a batch
 Step = Callable[[float, float, Array, Array, Force], tuple[Array, Array]]
-#: How often a step near a singular pose is split in two, and the part that comes first: a pose at a stage of Gauss's
-#: three is at none of either part.
-_SPLITS: Final = 4
-_FIRST_PART: Final = 0.4
 
 
 def to_body_velocity(space: Space, q: Array, w: Array) -> Array:
@@ -238,9 +234,7 @@ def divergence_reason(dyn: Dynamics, method: str, t: float, h: float, q: Array, 
 def make_step(method: str, field: Field, space: Space) -> Step:
     """Return the step of a fixed-step method, of one state or a batch; under constraints its end is to be projected.
 
-    f̈ = 0 divides the stages' distance from the constraints by J's smallest singular value. Near a singular pose a step
-    is one of Gauss's collocation, whose stages are close to the motion, and none at an end that may be the pose; where
-    one comes close to it all the same, it is two such steps, whose stages are elsewhere.
+    The states at its ends and its middle alone decide whether it is a `StepNearPose`.
     """
     formula = method_of(method).formula
     if isinstance(formula, ImplicitTableau):
@@ -248,36 +242,23 @@ def make_step(method: str, field: Field, space: Space) -> Step:
     else:
         assert isinstance(formula, (Tableau, SemiImplicitEuler))
         attempt = _ExplicitStep(formula, field, space)
-    collocation = CollocationStep(gauss_legendre(3), field, space)
-
-    def near_pose(t: float, h: float, q: Array, w: Array, force: Force, splits: int) -> tuple[Array, Array]:
-        field.near = True
-        try:
-            return collocation(t, h, q, w, force)
-        except DivergenceError:
-            if not splits:
-                raise
-        first = _FIRST_PART * h
-        q, w = field.settled(t + first, *near_pose(t, first, q, w, force, splits - 1))
-        return near_pose(t + first, h - first, q, w, force, splits - 1)
+    near_pose = StepNearPose(field, space, LOOSEST)
 
     def step(t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
         field.near = False
         if not field.projects:
             return attempt(t, h, q, w, force)
-        alone = q.size == q.shape[-1]
-        splits = _SPLITS if alone else 0
         try:
             q1, w1 = attempt(t, h, q, w, force)
         except DivergenceError:
-            # Each of a batch is then asked by itself.
-            if not alone:
+            # Of a batch each is then asked by itself.
+            if q.size > q.shape[-1]:
                 raise
-            return near_pose(t, h, q, w, force, splits)
+            return near_pose(t, h, q, w, force)
         near = manifold_at(field.dyn, t).nears_pose(t, q, h, q1)
         if not near.any():
             return q1, w1
-        careful = near_pose(t, h, q, w, force, splits)
+        careful = near_pose(t, h, q, w, force)
         return np.where(near[..., None], careful[0], q1), np.where(near[..., None], careful[1], w1)
 
     return step

@@ -7,16 +7,16 @@ on (q, v) as here.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import sqrt
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import EPS, Array
-from mbkit.methods.tableaus import ImplicitTableau, extrapolation_weights
+from mbkit.methods.tableaus import ImplicitTableau, extrapolation_weights, gauss_legendre
 from mbkit.model.integration_space import Space
-from mbkit.simulate.singular_poses import LOOSEST
 from mbkit.simulate.solvers.vector_field import DIVERGED, DivergenceError, Field
 from mbkit.simulate.torque import Force
 
@@ -32,6 +32,10 @@ _MAX_VELOCITY_ROUNDING: Final = 1e-11
 _MAX_MOVE_ROUNDING: Final = 1e-13
 #: Largest difference of two times that are one, in steps.
 _MAX_TIME_ROUNDING: Final = 1e-9
+#: Most times that a step near a singular pose is split in two, and the length of the first part in steps: a pose at a
+#: stage of Gauss's three is at none of either part.
+_MAX_SPLITS: Final = 4
+_FIRST_PART: Final = 0.4
 _UNSOLVED: Final = "the iteration does not solve the equations of the step's stages"
 
 
@@ -60,10 +64,12 @@ class CollocationStep:
     The unknowns are the stages' rates (u̇, ẇ) side by side, (stages, ..., 2 nv).
     """
 
-    def __init__(self, tableau: ImplicitTableau, field: Field, space: Space) -> None:
+    def __init__(
+        self, tableau: ImplicitTableau, field: Field, space: Space, rounding: float = _MAX_VELOCITY_ROUNDING
+    ) -> None:
         self._A, self._b, self._c, self._s = tableau.A, tableau.b, tableau.c, tableau.stages
         self._times = tableau.c.tolist()
-        self._field, self._space, self._nv = field, space, space.nv
+        self._field, self._space, self._nv, self._rounding = field, space, space.nv, rounding
         # The last step, and the one before, from which it may be tried again.
         self._past: list[_Past] = []
 
@@ -99,11 +105,11 @@ class CollocationStep:
         """
         try:
             return self._iterated(start, guess, inverse)
-        except DivergenceError:
-            rates = self._newton(start, guess)
-            if rates is None:
-                raise
-            return rates, None
+        except DivergenceError as error:
+            try:
+                return self._newton(start, guess), None
+            except DivergenceError:
+                raise error from None
 
     def _iterated(self, start: _Start, guess: Array, inverse: Array | None) -> tuple[Array, Array | None]:
         unknown = np.full(start.w.shape[:-1], np.inf)
@@ -131,23 +137,20 @@ class CollocationStep:
                 fresh, last = True, unknown
         raise DivergenceError(_UNSOLVED)
 
-    def _newton(self, start: _Start, rates: Array) -> Array | None:
-        """Return the rates by Newton's method proper; None where that leads nowhere."""
+    def _newton(self, start: _Start, rates: Array) -> Array:
+        """Return the rates by Newton's method proper."""
         last = np.full(start.w.shape[:-1], np.inf)
         for _ in range(_MAX_NEWTON_ITERATIONS):
-            try:
-                change = self._mapped(start, rates) - rates
-                stages = zip(self._times, *self._stages(start, rates), strict=True)
-                J = np.stack([self._slopes(start, c, u, w) for c, u, w in stages])
-                change = _times(_inverse_of(np.einsum("ij,i...kl->...ikjl", start.h * self._A, J)), change)
-            except DivergenceError:
-                return None
+            change = self._mapped(start, rates) - rates
+            stages = zip(self._times, *self._stages(start, rates), strict=True)
+            J = np.stack([self._slopes(start, c, u, w) for c, u, w in stages])
+            change = _times(_inverse_of(np.einsum("ij,i...kl->...ikjl", start.h * self._A, J)), change)
             rates, size = rates + change, self._size(start.h, change)
             done, _ = self._judged(start, rates, size, last)
             if done.all():
                 return rates
             last = size
-        return None
+        raise DivergenceError(_UNSOLVED)
 
     def _judged(
         self, start: _Start, rates: Array, size: Array, last: Array
@@ -160,8 +163,9 @@ class CollocationStep:
             factor = size / last
             rest = size * factor / (1 - factor)
         done = (size <= EPS * speed) | (measurable & (factor < 1) & (rest <= EPS / 4 * speed))
-        least = LOOSEST if self._field.near else _MAX_VELOCITY_ROUNDING
-        done |= measurable & (factor > 0.5) & ((size <= least * speed) | (start.h * size <= _MAX_MOVE_ROUNDING))
+        done |= (
+            measurable & (factor > 0.5) & ((size <= self._rounding * speed) | (start.h * size <= _MAX_MOVE_ROUNDING))
+        )
         return done, measurable & ~(factor < _MAX_CONTRACTION)
 
     def _size(self, h: float, rates: Array) -> Array:
@@ -201,6 +205,53 @@ class CollocationStep:
             y[..., k] = (u if k < nv else w)[..., k % nv]
             J[..., k] = (moved - there) / size
         return J
+
+
+class StepNearPose:
+    """A step near a singular pose, of one state or a batch: of Gauss's collocation of order 6, or parts of such a step.
+
+    f̈ = 0 divides the stages' distance from the constraints by J's smallest singular value. Those of collocation are
+    close to the motion, and none is at an end, which may be the pose. `rounding` is the part of the velocity that is
+    rounding in the stages, where the same divides it; the end of a step is off by far less.
+    """
+
+    def __init__(self, field: Field, space: Space, rounding: float) -> None:
+        self._field, self._collocation = field, CollocationStep(gauss_legendre(3), field, space, rounding)
+        self._rounding = rounding
+
+    def __call__(
+        self, t: float, h: float, q: Array, w: Array, force: Force, splits: int = _MAX_SPLITS
+    ) -> tuple[Array, Array]:
+        """Return q and w after a step of h seconds, in parts where a stage comes close to the pose."""
+        near, self._field.near = self._field.near, True
+        try:
+            return self._collocation(t, h, q, w, force)
+        except DivergenceError:
+            # Of a batch each is then asked by itself.
+            if not splits or q.size > q.shape[-1]:
+                raise
+        finally:
+            self._field.near = near
+        return self._parts(self, t, h, q, w, force, splits - 1)
+
+    def to_tolerance(
+        self, t: float, h: float, q: Array, w: Array, force: Force, splits: int = _MAX_SPLITS
+    ) -> tuple[Array, Array]:
+        """Return q and w after h seconds, in parts until those of a part agree with the whole of it."""
+        whole, parts = self(t, h, q, w, force), self._parts(self, t, h, q, w, force, _MAX_SPLITS)
+        if all((np.abs(x - y) < self._rounding * (1 + np.abs(y))).all() for x, y in zip(whole, parts, strict=True)):
+            return parts
+        if not splits:
+            raise DivergenceError(_UNSOLVED)
+        return self._parts(self.to_tolerance, t, h, q, w, force, splits - 1)
+
+    def _parts(
+        self, step: Callable[..., Any], t: float, h: float, q: Array, w: Array, force: Force, splits: int
+    ) -> tuple[Array, Array]:
+        first = _FIRST_PART * h
+        q, w = self._field.settled(t + first, *step(t, first, q, w, force, splits))
+        end: tuple[Array, Array] = step(t + first, h - first, q, w, force, splits)
+        return end
 
 
 def _inverse_of(coupled: Array) -> Array:

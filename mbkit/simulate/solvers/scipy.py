@@ -75,7 +75,7 @@ class _Solve:
             across.follow(i)
         solver: Any = None
         first: float | None = None
-        interval = -1
+        interval, length = -1, 0.0
         for stop in self._stops:
             before, interval = interval, problem.interval(t)
             problem.sample(i, interval, t, y)
@@ -83,9 +83,10 @@ class _Solve:
             if solver is not None and interval != before:
                 # A held force jumps here, and with it all that the solver remembers. A multistep method starts again
                 # with order 1, for which its last step is too long.
-                first, solver = None if self._method.multistep else solver.h_abs, None
+                # The tiny steps of a start would not see a pose within a usual one.
+                length, first, solver = _length(solver), None if self._method.multistep else solver.h_abs, None
             while t < stop:
-                if across is not None and across.crosses(t, y, _length(solver)):
+                if across is not None and across.crosses(t, y, _length(solver) or length):
                     # Not to a time that is saved, which may be so near the pose that no step goes on from there.
                     (t, y), first, solver = across.cross(interval, problem.stops[interval]), None, None
                     yield t, y, across.at

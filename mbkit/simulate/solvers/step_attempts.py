@@ -33,6 +33,7 @@ from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.diagnostics.stiffness import RateJacobian
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.singular_poses import LOOSEST, Approach
+from mbkit.simulate.solvers.gauss import StepNearPose
 from mbkit.simulate.solvers.trajectory_record import AcceptedSteps, StoppedError, below_rounding, diverged
 from mbkit.simulate.solvers.vector_field import DivergenceError, Field, Rates
 from mbkit.simulate.torque import Force
@@ -84,6 +85,10 @@ class StepAttempts(Protocol):
 _MIN_RTOL_ACROSS_POSE: Final = 1e-13
 
 
+#: Part of the velocity that is rounding in stages of collocation at the shortest distance of a stop from a pose.
+_STAGES_NEAR_POSE: Final = 1e-7
+
+
 class RungeKuttaAttempts:
     """Attempts of rk853, one step of one trajectory at a time; `StepAttempts` says what its methods do."""
 
@@ -101,7 +106,7 @@ class RungeKuttaAttempts:
         self._stages = ArrayStages(self._tableau.stages, (space.nv,))
         self._force: Force = np.zeros(space.nv)
         self._h = self._t = self._stop = 0.0
-        self._why = ""
+        self._why, self._near_pose = "", StepNearPose(self._field, space, _STAGES_NEAR_POSE)
         #: Factor of the tolerance.
         self._slack = 1.0
 
@@ -171,24 +176,44 @@ class RungeKuttaAttempts:
             return []
         approach, length = self._field.approach, self._h
         if approach.crosses(length):
+            rest = self._stop - self._t
+            if rest <= length and approach.ends_close(rest) and (end := self._near_pose_to(self._stop)) is not None:
+                return [(0, end)]
             # A step that is to end behind the pose may not come close to it with its end.
-            length = approach.length(min(length, self._stop - self._t))
+            length = approach.length(min(length, rest))
         t = end_of_attempt(SCALARS, self._t, length, self._stop)
         step = t - self._t
         ends = [(self._t, self._q, self._w)]
         q, w, self._error = self._checked_attempt(step)
         good = self._error < 1 and step > 0
+        if not good and self._loosest and self._field.near_singular and (end := self._near_pose_to(t)) is not None:
+            return [(0, end)]
         self._settle(step, good)
         if good:
-            q, w = self._field.settled(t, q, w)
-            self._t, self._q, self._w, self._fresh = t, q, w, True
-            ends.append((t, q, w))
-        times, places, rates = zip(*ends, strict=True)
-        return [(0, AcceptedSteps(np.array(times), np.array(places), np.array(rates)))]
+            ends.append(self._arrive(t, q, w))
+        return [(0, _accepted(*ends))]
+
+    def _arrive(self, t: float, q: Array, w: Array) -> tuple[float, Array, Array]:
+        q, w = self._field.settled(t, q, w)
+        self._t, self._q, self._w, self._fresh = t, q, w, True
+        return t, q, w
+
+    def _near_pose_to(self, t: float) -> AcceptedSteps | None:
+        """Go on to a time without stages at the ends, one of which is close to a pose; None where that fails."""
+        start = self._t, self._q, self._w
+        try:
+            end = self._near_pose.to_tolerance(self._t, t - self._t, self._q, self._w, self._force)
+        except DivergenceError:
+            return None
+        self._error, self._slack = 0.0, 1.0
+        return _accepted(start, self._arrive(t, *end))
+
+    @property
+    def _loosest(self) -> bool:
+        return self._slack * self._tolerances.rtol >= LOOSEST
 
     def _settle(self, step: float, good: bool) -> None:
-        loose = self._slack * self._tolerances.rtol >= LOOSEST
-        if self._error >= 1 and not loose and self._field.near_singular:
+        if self._error >= 1 and not self._loosest and self._field.near_singular:
             # Near a singular pose shorter steps are no better: their stages are nearer to it, and rounding grows.
             across = 0 < self._field.approach.ahead < step
             self._slack, self._h, self._most = 10 * self._slack, self._h if across else 0.8 * self._h, 1.0
@@ -261,6 +286,11 @@ class RungeKuttaAttempts:
     def _inner(self, t: float, q: Array, w: Array, end: float) -> tuple[Array, Array]:
         self._fresh = True
         return self._step(t, q, w, end - t)[:2]
+
+
+def _accepted(*ends: tuple[float, Array, Array]) -> AcceptedSteps:
+    times, places, rates = zip(*ends, strict=True)
+    return AcceptedSteps(np.array(times), np.array(places), np.array(rates))
 
 
 class AcrossPoses(RungeKuttaAttempts):
