@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 import pickle
+import re
 import sys
 import warnings
 from dataclasses import replace
@@ -529,8 +530,8 @@ def test_results_can_be_kept(tmp_path):
     assert data["seed"] == 3
     assert data["versions"]["pin"]
     assert len(data["rows"][0]["worst_q"]) == 6
-    assert pickle.loads(pickle.dumps(result)).to_json() == result.to_json()
-    assert "| forward dynamics | mujoco |" in result.to_markdown()
+    assert re.search(r"\| forward dynamics \| pinocchio \|.*\n\| \| lagrangian \|.*\n\| \| mujoco \|", result.to_markdown())
+    assert re.search(r"\| forward dynamics \| .*\n\| \| mujoco \|", result.to_markdown())
     assert "<script>" not in replace(result, model="<script>")._repr_html_()
     with pytest.raises(OutputError, match="result itself is kept"):
         result.to_json(tmp_path / "r.json" / "below_a_file.json")
