@@ -166,7 +166,7 @@ print(*sorted(m for m in set(sys.modules) - before))
 """
     env = os.environ | {"PYTHONPATH": os.pathsep.join([str(TOP), os.environ.get("PYTHONPATH", "")])}
     made = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
-    assert made.stdout.split() == ["mbkit", "mbkit._version", "mbkit.pytest_plugin"]
+    assert made.stdout.split() == ["mbkit", "mbkit._imports", "mbkit._version", "mbkit.pytest_plugin"]
 
 
 # The asserts, wherever they are called.
