@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 #: Tolerance that rk853 may take near a singular pose, where rounding keeps it from a tighter one.
 LOOSEST: Final = 1e-9
 #: Steps within which a pose is near. At a third of the way a series of the tightest tolerance never arrives.
-_AHEAD: Final = 4
+AHEAD: Final = 4
 #: Steps' ends that decide on one interval.
 _WINDOW: Final = 4
 #: Of the rows' size, 1/s: what typed digits leave of a velocity that is zero.
@@ -201,10 +201,10 @@ class Approach:
     def crosses(self, h: float) -> bool:
         """Return whether a pose is within a few steps of length h, ahead or behind; then it is `near`."""
         # A pace that is not known is not above.
-        self.near = not (self._distance > _AHEAD * h * self._pace).all()
+        self.near = not (self._distance > AHEAD * h * self._pace).all()
         if self.near and self._unseen is not None:
             self.ahead, self._unseen = _time_ahead(*self._unseen), None
-        self.near = self.near and bool((np.abs(self.ahead) <= _AHEAD * h).any())
+        self.near = self.near and bool((np.abs(self.ahead) <= AHEAD * h).any())
         return self.near
 
     def length(self, h: float) -> float:

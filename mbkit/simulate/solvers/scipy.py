@@ -75,7 +75,7 @@ class _Solve:
             across.follow(i)
         solver: Any = None
         first: float | None = None
-        interval, length = -1, 0.0
+        interval = -1
         for stop in self._stops:
             before, interval = interval, problem.interval(t)
             problem.sample(i, interval, t, y)
@@ -83,10 +83,9 @@ class _Solve:
             if solver is not None and interval != before:
                 # A held force jumps here, and with it all that the solver remembers. A multistep method starts again
                 # with order 1, for which its last step is too long.
-                # The tiny steps of a start would not see a pose within a usual one.
-                length, first, solver = _length(solver), None if self._method.multistep else solver.h_abs, None
+                first, solver = None if self._method.multistep else solver.h_abs, None
             while t < stop:
-                if across is not None and across.crosses(t, y, _length(solver) or length):
+                if across is not None and across.crosses(t, y, solver and _length(solver), interval, stop):
                     # Not to a time that is saved, which may be so near the pose that no step goes on from there.
                     (t, y), first, solver = across.cross(interval, problem.stops[interval]), None, None
                     yield t, y, across.at
@@ -177,7 +176,7 @@ class _Solve:
 
 def _length(solver: Any) -> float:
     """Return the length of the next step; of LSODA, which does not tell it, that of the last one."""
-    return 0.0 if solver is None else float(getattr(solver, "h_abs", solver.step_size or 0.0))
+    return float(getattr(solver, "h_abs", solver.step_size or 0.0))
 
 
 def _resize(solver: Any, length: float) -> None:

@@ -32,7 +32,7 @@ from mbkit.model.integration_space import Space
 from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.diagnostics.stiffness import RateJacobian
 from mbkit.simulate.problem import IntegrationProblem
-from mbkit.simulate.singular_poses import LOOSEST, Approach
+from mbkit.simulate.singular_poses import AHEAD, LOOSEST, Approach
 from mbkit.simulate.solvers.gauss import StepNearPose
 from mbkit.simulate.solvers.trajectory_record import AcceptedSteps, StoppedError, below_rounding, diverged
 from mbkit.simulate.solvers.vector_field import DivergenceError, Field, Rates
@@ -303,18 +303,27 @@ class AcrossPoses(RungeKuttaAttempts):
         super().__init__(problem, Space(problem.dyn.model), problem.tolerances)
         self._model = problem.dyn.model
         self._last_step: AcceptedSteps | None = None
+        #: Part of a step of rk853 by which to look ahead, s; and the time at which it is to be estimated again.
+        self._usual, self._estimate_until = 0.0, math.inf
 
     @classmethod
     def of(cls, problem: IntegrationProblem) -> AcrossPoses | None:
         """Return those of a run; None where nothing is projected."""
         return cls(problem) if problem.dyn._projects else None
 
-    def crosses(self, t: float, y: Array, h: float) -> bool:
-        """Return whether a step of length h from a state would meet a pose; `cross` then starts there."""
+    def crosses(self, t: float, y: Array, h: float | None, k: int | None = None, stop: float = math.inf) -> bool:
+        """Return whether a step of length h from a state would meet a pose; `cross` then starts there.
+
+        Steps of SciPy's methods, under force k, are tiny after a start, where h is None, and shrink with the way to a
+        pose: none would ever meet it. These methods look ahead by a step of rk853 too.
+        """
         q, v = unit_quaternions(self._model, y[: self._model.nq])[0], y[self._model.nq :]
         w = self._space.to_integrator_velocity(q, v)
         self._begin(t, q, w)
-        out = self.approach.crosses(h)
+        if k is not None and (h is None or t >= self._estimate_until):
+            self.hold(k, stop)
+            self._usual, self._estimate_until = self._h / AHEAD, t + self._h
+        out = self.approach.crosses(max(h or 0.0, self._usual))
         if out:
             # A method of several steps leaves the constraints by its errors.
             self._q, self._w = self._field.settled(t, q, w)
@@ -337,6 +346,13 @@ class AcrossPoses(RungeKuttaAttempts):
         assert self._last_step is not None
         q, w = self.within(0, self._last_step.rows(np.array([0])), np.array([t]))
         return self._vector(q[0], w[0])
+
+    def _inner(self, t: float, q: Array, w: Array, end: float) -> tuple[Array, Array]:
+        # A step that was long enough for its stages is shortened: one of them may come close to the pose.
+        try:
+            return self._near_pose.to_tolerance(t, end - t, q, w, self._force)
+        except DivergenceError:
+            return super()._inner(t, q, w, end)
 
     def _vector(self, q: Array, w: Array) -> Array:
         return np.concatenate([q, self._space.to_body_velocity(q, w)])
