@@ -944,3 +944,22 @@ def test_what_a_file_of_another_format_cannot_hold_is_not_compared(tmp_path):
     shown = CliRunner().invoke(cli, ["diff", str(tmp_path / "a.xml"), str(tmp_path / "a.urdf")])
     first = " ".join(shown.output.split("\n\n")[0].split())
     assert "not compared: options of simulation, servos, force ranges, contacts, limits of a.xml" in first
+
+
+@pytest.mark.parametrize("more", [False, True])
+def test_a_body_behind_a_joint_of_one_side_alone_does_not_stand_still(more: bool) -> None:
+    def built(base: float, second: bool) -> Model:
+        b = mb.ModelBuilder("robot")
+        if base:
+            b.add_body("base", mass=base)
+            b.add_joint("weld", "fixed", parent="world", child="base")
+        for name in ["first", "second"][: 1 + second]:
+            b.add_body(f"{name} link", mass=1.2, com=(0.1, 0, 0), inertia=(0.1, 0.1, 0.1))
+            b.add_joint(name, "revolute", parent="world", child=f"{name} link", axis=(0, 1, 0))
+        return b.build()
+
+    found = mb.explain(built(3.0, False), built(0.0, more), names=("first", "second"))
+    (base,) = (c for c in found.causes if c.kind == "base mass")
+    assert (base.a, base.b) == (3.0, 0.0)
+    assert "no mass in what stands still, where first has 3 kg" in str(base)
+    assert not any(c.kind == "base mass" for c in mb.explain(built(3.0, False), built(3.0, more)).causes)

@@ -346,6 +346,9 @@ def test_what_an_engine_cannot_do_has_a_reason():
         mujoco.coriolis_matrix(model.neutral(), np.zeros(model.nv))
     with pytest.raises(UnsupportedError, match="lagrangian"):
         mb.dynamics(model).function("nle")
+    for name in (3, None, ["pose"]):
+        with pytest.raises(InputError, match="name: expected the name of a quantity"):
+            mb.dynamics(mb.catalog.pendulum(), "lagrangian").function(name)  # type: ignore[arg-type]
     with pytest.raises(UnsupportedError, match="'j0' is a helical joint"):
         mb.dynamics(random_tree(0, 1, ("helical",)), "mujoco")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -518,6 +519,22 @@ def test_states_within_a_step_across_a_singular_pose_are_those_of_the_motion(met
     assert len(run.t) == 401
     assert run.v[:, crank] == pytest.approx(-speed(run.q[:, crank]), rel=1e-7)
     assert quad(lambda x: 1 / speed(x), run.q[-1, crank], 0.5)[0] == pytest.approx(0.7, rel=1e-7)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_moreau_s_steps_tell_the_singular_pose_that_they_pass(count: int) -> None:
+    dyn = mb.dynamics(parallelogram((0.05,) * 3, 0.05), "lagrangian")
+    q, v = turned(dyn.model, 0.1), -3.0 * turned(dyn.model, 1.0)
+    speeds = np.linspace(1.0, 0.0, count)[:, None]
+    states = (q, v) if count == 1 else (np.repeat(q[None], count, axis=0), speeds * v)
+    with pytest.warns(DoubtfulRunWarning, match="passed a singular pose") as warned:
+        run = mb.simulate(dyn, *states, 0.08, "moreau", dt=5e-4)
+    text = str(warned[0].message)
+    assert count == 1 or "2 of 3 trajectories" in text
+    time, _ = quad(lambda x: (9 + (9.81 * 1.25 * (np.sin(0.1) - np.sin(x)) - 0.2 * (0.1 - x)) / 0.25) ** -0.5, 0, 0.1)
+    assert float(re.search(r"t = (\S+) \(s\)", text)[1]) == pytest.approx(time, rel=2e-3)
+    # A method with a fixed step has no tolerance.
+    assert "tolerance" not in str(run.stats.doubts)
 
 
 @pytest.mark.parametrize("method", ["rk4", "gauss4"])

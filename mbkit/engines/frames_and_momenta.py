@@ -20,7 +20,7 @@ from mbkit._check import CLASSICAL as CLASSICAL
 from mbkit._check import LOCAL as LOCAL
 from mbkit._check import SPATIAL as SPATIAL
 from mbkit._check import WORLD as WORLD
-from mbkit._check import Array
+from mbkit._check import Array, shown
 from mbkit._check import axes_named as axes_named
 from mbkit.engines.evaluation import Evaluation
 from mbkit.errors import InputError
@@ -251,6 +251,8 @@ class FramesAndMomenta(Evaluation):
         >>> dyn.function("jacobian", frame="tip")
         Function(jacobian:(q)->(jacobian[6]) SXFunction)
         """
+        if not isinstance(name, str):
+            raise InputError(f"name: expected the name of a quantity, such as 'mass_matrix', got {shown(name)}")
         dyn = self._matter if name in OF_THE_WHOLE and self.model.rotors else self
         return dyn._method("function")(name, frame, axes_named(axes), kind)
 

@@ -290,26 +290,28 @@ class SingularPoses:
             nearest = 1 if s1 < s2 else 2
             self._passed(times[1] + float(within[0]), times[nearest], q[nearest])
 
-    def describe(self) -> str:
-        """Return the poses in a sentence; empty where there are none."""
+    def describe(self, tolerance: bool) -> str:
+        """Return the poses in a sentence, for a method with or without a tolerance; empty where there are none."""
         if not self.times:
             return ""
         when = ", ".join(f"{t:.4g}" for t in self.times[:3]) + (" and later" if len(self.times) > 3 else "")
         names = manifold_at(self._dyn, self.times[0]).names
         rows = " and ".join(names[k] for k in self._rows)
+        error = f"; a step there may be off by {LOOSEST:g} whatever the tolerance" if tolerance else ""
         return (
             f"passed a singular pose at t = {when} (s), where {rows} lose their independence; other motions may begin "
-            f"there, and the run followed the smooth one; a step there may be off by {LOOSEST:g} whatever the tolerance"
+            f"there, and the run followed the smooth one{error}"
         )
 
 
 class SingularPosesOfBatch:
     """The singular poses that trajectories pass which step together, by their numbers."""
 
-    def __init__(self, dyn: Dynamics, t: float, q: Array) -> None:
-        self.members = {i: SingularPoses(dyn._of_samples([i])) for i in range(len(q))}
-        for poses, start in zip(self.members.values(), q, strict=True):
-            poses.began(t, start)
+    def __init__(self, dyn: Dynamics, t: float, q: Array, members: Iterable[int] | None = None) -> None:
+        which = range(len(q)) if members is None else members
+        self.members = {i: SingularPoses(dyn._of_samples([i])) for i in which}
+        for i, poses in self.members.items():
+            poses.began(t, q[i])
 
     def saw(self, dyn: Dynamics, t: float, q: Array, members: Iterable[int]) -> None:
         """Take in the ends of the steps of these members, whose dynamics are `dyn`."""
@@ -317,15 +319,20 @@ class SingularPosesOfBatch:
             self.members[int(i)].take(t, depends, at)
 
 
-def describe_poses(members: Mapping[int, SingularPoses], batch: int | None) -> str:
-    """Return the poses that one trajectory, or some of a batch, passed in a sentence; empty where there are none."""
+def describe_poses(members: Mapping[int, SingularPoses], batch: int | None, tolerance: bool) -> str:
+    """Return the poses that one trajectory, or some of a batch, passed in a sentence; empty where there are none.
+
+    Its method has a tolerance, or a step.
+    """
     passed = {i: poses for i, poses in members.items() if poses.times}
     if not passed:
         return ""
     first, poses = min(passed.items())
     if batch is None:
-        return poses.describe()
-    return f"{len(passed)} of {batch} trajectories passed singular poses; trajectory {first} {poses.describe()}"
+        return poses.describe(tolerance)
+    return (
+        f"{len(passed)} of {batch} trajectories passed singular poses; trajectory {first} {poses.describe(tolerance)}"
+    )
 
 
 def _bend(t: Iterable[float], x: Iterable[float]) -> float:

@@ -59,6 +59,7 @@ class RunRecord:
         """Return the result with states (N, K, ·) at common times, and the time that each trajectory reached."""
         batch = self.problem.batch
         ended, message = self._end(reached)
+        passed = describe_poses(self.poses, batch, tolerance=self.problem.equal_steps is None)
         return SolverResult(
             t=np.array(t, dtype=np.float64),
             q=q[0] if batch is None else q,
@@ -74,7 +75,7 @@ class RunRecord:
             error=self.error,
             last=self.last,
             chosen=self.chosen,
-            doubts=tuple(dict.fromkeys(filter(None, (describe_poses(self.poses, batch), *self.doubts)))),
+            doubts=tuple(dict.fromkeys(filter(None, (passed, *self.doubts)))),
         )
 
     def _end(self, reached: list[float]) -> tuple[Ended, str]:

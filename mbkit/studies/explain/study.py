@@ -131,7 +131,8 @@ class _Descriptions:
 
     def explain(self) -> Explanation:
         near = Tolerances.of(self.a, self.tolerance)
-        by_name = self._gaps_by_name(merge(self.a), merge(self.b))
+        wholes = merge(self.a), merge(self.b)
+        by_name = self._gaps_by_name(*wholes)
         one, other, matching, structural = reconcile_joint_sets(self.a, self.b, near)
         theirs = rename_joints(other, one.model, matching)
         target, moved_frames = align_frames(theirs, one.model, near)
@@ -148,7 +149,12 @@ class _Descriptions:
             *(self._cause(h, {"M": np.inf}) for h in structural),
             *self._naming_causes(one, other, matching, by_name),
             *(self._measured_cause(h, one, target) for h in hypotheses),
-            *(self._cause(h, {}) for h in ground_differences(one, target, near, self.names[0])),
+            # Joints that one side alone has are locked here; a body behind one of them does not stand still.
+            *(
+                self._cause(h, {})
+                for h in ground_differences(*links_in_common_axes(*wholes, near), near, self.names[0])
+                if not near.same(one.ground, target.ground)
+            ),
         )
         acting = [c.kind for c in causes if c.acts]
         massless = bool(one.model.nv) and self._is_massless(one.model) and self._is_massless(target.model)

@@ -18,6 +18,7 @@ from mbkit.errors import FunctionError, NumericalError
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
+from mbkit.simulate.singular_poses import SingularPosesOfBatch
 from mbkit.simulate.solvers.friction.phases import Friction, applied, force_of, side_by_side
 from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.solvers.vector_field import DIVERGED
@@ -81,6 +82,10 @@ class _InPython:
         self._rubs = np.broadcast_to(self._law.bound > 0, none.shape)
         # Without friction: neither a side nor rest.
         self._smooth = self._friction.given(none, none > 0, none > 0, dyn).dyn if self._rubs.any() else dyn
+        self._poses: SingularPosesOfBatch | None = None
+        if dyn._projects:
+            self._poses = SingularPosesOfBatch(problem.dyn, problem.start, problem.q, members.tolist())
+            record.poses = {**record.poses, **self._poses.members}
 
     def run(self) -> tuple[int, int, str]:
         """Return the good steps, the evaluations, and why there are not more."""
@@ -100,6 +105,8 @@ class _InPython:
                 return k, evaluations, str(error)
             if not (np.abs(q).max(initial=0) < _RUNAWAY and np.abs(v).max(initial=0) < _RUNAWAY):
                 return k, evaluations, DIVERGED
+            if self._poses is not None:
+                self._poses.saw(self._dyn, grid.time(k + 1), q, members)
             rows = record.rows(k + 1, k + 1)
             record.q[members, rows], record.v[members, rows] = q[:, None], v[:, None]
         return grid.steps, grid.steps * len(members), ""
