@@ -17,7 +17,9 @@ from mbkit.engines.registry import composes
 from mbkit.errors import UnsupportedError
 from mbkit.model import Model
 from mbkit.model.quantities import of_groups
+from mbkit.simulate import simulate
 from tests.random_trees import ALL, IN_MUJOCO, SOUND, off, random_tree, states
+from tests.scenes import mounted
 
 EPS = np.finfo(float).eps
 #: Normwise, of trees of ten bodies: what large terms leave of their rounding where they cancel.
@@ -345,3 +347,57 @@ def test_the_book_says_which_quantities_of_an_engine_are_its_own():
             source = "".join(path.read_text("utf-8") for path in (root / "engines" / engine).glob("*.py"))
             for function in re.findall(r"`[\w.]*?(\w+)`", cell):
                 assert function in source, (name, engine)
+
+
+@pytest.mark.thorough("all joint types", "floating", "sound")
+@pytest.mark.parametrize("name", TREES)
+def test_the_whole_has_the_mass_weight_and_momentum_of_its_parts(name):
+    model, (q, v, _, _) = tree(name), at(name).values()
+    dyn = mb.dynamics(model, "lagrangian")
+    weight = model.mass * model.gravity
+    J, A = dyn.center_of_mass_jacobian(q), dyn.centroidal_momentum_matrix(q)
+    still = mb.dynamics(model.without("springs"), "lagrangian") if model.needs.springs else dyn
+    assert off(still.potential_energy(q), -dyn.center_of_mass(q) @ weight) < CLOSE
+    assert off(dyn.gravity(q), -np.einsum("nij,i->nj", J, weight)) < CLOSE
+    assert off(A[:, :3], model.mass * J) < CLOSE
+    assert off(np.einsum("nij,nj->ni", A, v), dyn.centroidal_momentum(q, v)) < CLOSE
+    assert off(np.einsum("nij,nj->ni", J, v), dyn.center_of_mass_velocity(q, v)) < CLOSE
+    locked = dyn.locked_inertia(q)
+    assert np.array_equal(locked[0, :3, :3], locked[0, 0, 0] * np.eye(3))
+    assert locked[0, 0, 0] == pytest.approx(model.mass, rel=1e-14)
+    assert np.linalg.eigvalsh(locked).min() > 0
+
+
+def test_a_load_along_the_joint_is_its_force():
+    """Less what the rotor takes; springs between points are no part of a joint."""
+    model = random_tree(6, 9, ALL, springs=False, damping=False)
+    q, v, a, _ = states(model, 2)
+    for engine in ("lagrangian", "pinocchio"):
+        dyn = mb.dynamics(model, engine)
+        force = dyn.inverse_dynamics(q, v, a)
+        carried = dyn.joint_wrenches(q, v, a)
+        for joint, load in zip([j for j in model.joints if j.type.nv], carried.swapaxes(0, 1), strict=True):
+            own = model.layout.full_v[joint.name]
+            along = dyn.jacobian(q, joint.child, LOCAL)[:, :, own]
+            expected = force[:, own] - joint.armature * a[:, own]
+            assert off(np.einsum("nij,ni->nj", along, load), expected) < CLOSE, joint.name
+
+
+def test_nothing_outside_means_no_change_of_momentum():
+    model = random_tree(21, 5, ("revolute", "ball", "prismatic"), **NOTHING, gravity=False)
+    b = mounted("adrift", "base", "float", "free", gravity=(0, 0, 0), mass=1.0, inertia=(0.2, 0.3, 0.4))
+    for body in model.bodies:
+        b.add_body(body.name, mass=body.mass, com=body.com, inertia=body.inertia)
+    for joint in model.joints:
+        axis = {"axis": joint.axes[0]} if joint.type.n_axes else {}
+        parent = "base" if joint.parent == "world" else joint.parent
+        place = {"translation": joint.translation, "rotation": joint.rotation}
+        b.add_joint(joint.name, joint.kind, parent=parent, child=joint.child, **place, **axis)
+    adrift = b.build()
+    dyn = mb.dynamics(adrift, "lagrangian")
+    q, v = adrift.random_state(np.random.default_rng(2))
+    run = simulate(dyn, q, 0.3 * v, 0.3, method="rk853", rtol=1e-11)
+    h = dyn.centroidal_momentum(run.q, run.v)
+    assert np.abs(h - h[0]).max() < 1e-9 * np.abs(h[0]).max()
+    straight = dyn.center_of_mass(run.q) - run.t[:, None] * h[0, :3] / adrift.mass
+    assert np.abs(straight - straight[0]).max() < 1e-9

@@ -340,3 +340,32 @@ def test_a_beam_of_small_deflections_is_no_negative_mass():
 def test_what_is_refused(make, error, words):
     with pytest.raises(error, match=words):
         make()
+
+
+def test_exact_modes_of_a_cantilever():
+    a = CANTILEVER.discretized(mb.lagrangian.clamped_free(4, x, L))
+    k = Lagrangian(a.T, a.V, a.coordinates, parameters={rho: 1.0, EI: 1.0, L: 1.0})
+    assert k.kinetic.M.subs({rho: 1, L: 1}) == sp.eye(4)
+    assert k.V.subs({EI: 1, L: 1}).coeff(a.coordinates[0] * a.coordinates[1]) == 0
+    found, exact = mb.equilibrium(k, np.zeros(4)).frequencies, beams.cantilever(1, 1, 1, 0, 0, 4)
+    assert np.abs(np.sort(found) / np.array(exact, dtype=float) - 1).max() < 1e-13
+    assert np.abs(np.abs(a.at(1.0)) - 2).max() < 1e-14
+    assert a.at([0.0, 1.0]).shape == (2, 4)
+
+
+def test_without_stiffening_the_energy_is_that_of_points_that_move_across_only():
+    th = sp.Symbol("theta")
+    found = beam(L, EI, rho, rotation=th, coordinates=[th], stiffening=False).discretized([(s / L) ** 2])
+    turn = sp.Symbol("thetadot")
+    assert sp.expand(found.T.coeff(turn**2)).coeff(sp.Symbol("a1") ** 2) == L * rho / 10
+
+
+def test_chains_of_rigid_segments_come_to_the_beam_as_the_square_of_their_length():
+    exact = float(beams.cantilever(beams.EI, beams.DENSITY, beams.LENGTH, 0, 0, 1)[0])
+    for engine in ("pinocchio", "mujoco"):
+        errors = []
+        for n in (6, 12):
+            M = mb.dynamics(flexible.rotor(1).segmented(n), engine).mass_matrix(np.zeros(n + 1))[1:, 1:]
+            K = np.eye(n) * beams.EI * n / beams.LENGTH
+            errors.append(np.sqrt(np.linalg.eigvals(np.linalg.solve(M, K)).real.min()) / exact - 1)
+        assert 1.9 < np.log2(errors[0] / errors[1]) < 2.1

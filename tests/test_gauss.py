@@ -205,3 +205,13 @@ def test_a_torque_function_that_jumps_within_a_step_is_told() -> None:
     with pytest.warns(MbkitWarning, match="the iteration does not solve"):
         run = simulate(dyn, [0.0], [1e-3], 1.0, "gauss4", dt=0.1, torque=lambda t, q, v: -9 * np.sign(v))
     assert run.stats.ended == "diverged"
+
+
+@pytest.mark.parametrize("method", GAUSS)
+def test_time_can_be_turned_back_without_quaternions(method: str) -> None:
+    model, q, v, duration = cases()["double pendulum"]
+    dyn = mb.dynamics(model)
+    there = simulate(dyn, q, v, duration, method, dt=0.02)
+    back = simulate(dyn, there.q[-1], -there.v[-1], duration, method, dt=0.02)
+    assert back.q[-1] == pytest.approx(q, abs=1e-13)
+    assert back.v[-1] == pytest.approx(-v, abs=1e-12)

@@ -225,3 +225,13 @@ def test_mobility_of_cranks_that_begin_folded() -> None:
         for found in (dyn.mobility(), dyn.mobility([0.7] * n + [-0.7])):
             assert (found.degrees_of_freedom, len(found.redundant)) == (1, redundant)
     assert "none is redundant" in str(mb.dynamics(equal_cranks(2), "lagrangian").mobility())
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+def test_loops_hold_through_a_blow(engine) -> None:
+    dyn = mb.dynamics(mb.catalog.four_bar(), engine)
+    q, v = dyn.project([0.5, 0.0, 1.0], [1.0, 0.0, 0.0])
+    hit = mb.impact(dyn, q, v, [0.1, 0.0, 0.0])
+    assert dyn.constraint_rate(q, hit.v) == pytest.approx(np.zeros(2), abs=1e-13)
+    jump = dyn.mass_matrix(q) @ (hit.v - v) - dyn.constraint_jacobian(q).T @ hit.reactions
+    assert jump == pytest.approx([0.1, 0.0, 0.0], abs=1e-14)

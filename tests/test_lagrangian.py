@@ -145,3 +145,22 @@ def test_gravity_free_models_have_no_gravity_in_the_graph():
 def test_unknown_quantities_are_named():
     with pytest.raises(UnknownNameError, match="mass_matrix"):
         mb.dynamics(mb.load("ur5"), "lagrangian").function("mass_matrx")
+
+
+def test_kinetic_energy_is_half_v_m_v(tree):
+    _, dyn, (q, v, _, _) = tree
+    assert off(dyn.kinetic_energy(q, v), 0.5 * np.einsum("ni,nij,nj->n", v, dyn.mass_matrix(q), v)) < CLOSE
+
+
+def test_quasi_velocities_give_eulers_equations():
+    """A free body without forces: I ω̇ + ω × I ω = 0 and m (v̇ + ω × v) = 0."""
+    b = mb.ModelBuilder("free", gravity=(0, 0, 0))
+    inertia = np.array([[2.0, 0.1, 0.2], [0.1, 3.0, 0.3], [0.2, 0.3, 4.0]])
+    b.add_body("a", mass=5.0, inertia=inertia)
+    b.add_joint("j", "free", parent="world", child="a")
+    model = b.build()
+    q, v, _, _ = (x[0] for x in states(model, 1))
+    linear, w = v[:3], v[3:]
+    expected = np.concatenate([-np.cross(w, linear), -np.linalg.solve(inertia, np.cross(w, inertia @ w))])
+    for engine in ("pinocchio", "lagrangian", "mujoco"):
+        assert off(mb.dynamics(model, engine).forward_dynamics(q, v, 0 * v), expected) < 1e-14

@@ -511,3 +511,14 @@ def test_a_bicycle_that_lies_flat_is_no_random_state_and_has_no_projection() -> 
     flat = np.array([0, 0, 0, 0.3, np.pi / 2, 0, 0, 0, 0])
     with pytest.raises(mb.errors.MbkitError, match="singular on what the constraints leave free"):
         mb.dynamics(model, "lagrangian").project(flat, np.ones(9))
+
+
+def test_wheels_carry_the_weight() -> None:
+    """At rest and upright, by the levers of the masses about both contacts."""
+    model = mb.catalog.bicycle()
+    dyn = mb.dynamics(model, "pinocchio")
+    forces = dyn.constraint_forces(np.zeros(9), np.zeros(9), np.zeros(9))
+    moment = 0.3 * 85 + 0.9 * 4 + 1.02 * 3
+    # It begins to fall about its wheels, straight to one side: the normal forces are those of rest.
+    assert forces[1] == pytest.approx(9.81 * moment / 1.02, rel=1e-12)
+    assert forces[0] + forces[1] == pytest.approx(9.81 * 94, rel=1e-12)

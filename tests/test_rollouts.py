@@ -396,3 +396,33 @@ def test_an_error_in_the_callers_function_stops_the_threads(
         dyn = dynamics(planar.model, "lagrangian", compile=True, threads=threads)
         with pytest.raises(StopError):
             simulate(dyn, q, v, 1e3, save=[0.0], progress=stop)
+
+
+@pytest.mark.parametrize(("method", "order"), [("rk4", 4), ("semi_implicit_euler", 1)])
+def test_order_of_convergence_and_of_energy(method: str, order: int, floating: LagrangianDynamics) -> None:
+    q, v = start(floating, 4, seed=2)
+    fine = simulate(floating, q, v, 0.4, "rk4", dt=2.5e-4, save=[0.4])
+    steps = [2e-2, 1e-2, 5e-3] if method == "rk4" else [4e-4, 2e-4, 1e-4]
+    errors, drift = [], []
+    for dt in steps:
+        run = simulate(floating, q, v, 0.4, method, dt=dt, save=[0.0, 0.4])
+        errors.append(np.linalg.norm(floating.model.difference(run.q[:, -1], fine.q[:, -1])))
+        drift.append(np.abs(np.diff(run.energy())).max())
+    slopes = [np.polyfit(np.log(steps), np.log(x), 1)[0] for x in (errors, drift)]
+    assert slopes[0] == pytest.approx(order, abs=0.25)
+    assert slopes[1] > order - 0.35
+
+
+def test_quaternions_stay_of_unit_length(floating: LagrangianDynamics) -> None:
+    q, v = start(floating, 3)
+    run = simulate(floating, q, 4 * v, 1.0, dt=5e-3, save=10)
+    for first, _ in floating.model.quaternions:
+        assert np.abs(np.linalg.norm(run.q[..., first : first + 4], axis=-1) - 1).max() < 8 * EPS
+
+
+def test_a_body_without_forces_keeps_its_velocity_to_the_bit() -> None:
+    dyn = dynamics(catalog.free_body().without("gravity"), "lagrangian", compile=True)
+    q, v = dyn.model.random_state(np.random.default_rng(0), 4)
+    run = simulate(dyn, q, v, 0.5)
+    world = Space(dyn.model).to_integrator_velocity(run.q.reshape(-1, 7), run.v.reshape(-1, 6))[:, :3].reshape(4, -1, 3)
+    assert np.abs(world - world[:, :1]).max() < 32 * EPS * np.abs(world).max()

@@ -16,7 +16,7 @@ from mbkit.errors import UnknownNameError
 from mbkit.model.validation import sample_mass_matrix
 from mbkit.simulate import simulate
 from mbkit.studies.motions import exact as exact_motions
-from mbkit.studies.motions.exact import cart_pole, precession
+from mbkit.studies.motions.exact import cart_pole, pendulum, precession
 from mbkit.studies.motions.reference import gap
 from mbkit.studies.stress import cases
 from mbkit.studies.stress.case import Case, problem_of, times_of
@@ -314,3 +314,11 @@ def test_a_step_multiplies_by_what_theory_says(name: str) -> None:
             columns.append([run.q[-1, 0], run.v[-1, 0]])
         seen = np.abs(np.linalg.eigvals(np.array(columns))).max()
         assert seen == pytest.approx(amplification(method, frequency * value, zeta), rel=1e-7), method
+
+
+def test_pendulums_agree_with_40_digits() -> None:
+    t = np.linspace(0, 2, 4)
+    for theta, speed, square in ((1.0, 0.0, 9.81), (1.0, 1.0, 1e-6), (0.5, -7.0, 9.81), (1.0, 0.0, 1e6)):
+        told = elliptic.pendulum(t, theta, speed, 1, square)[0]
+        assert pendulum(theta, speed, square)(t) == pytest.approx(told, abs=1e-15 * (1 + 2 * math.sqrt(square)) * 8)
+    assert pendulum(1.0, 0.5, 0.0)(t)[:, 0] == pytest.approx(1 + 0.5 * t, abs=1e-15)

@@ -286,3 +286,15 @@ def test_a_state_that_grows_beyond_all_bounds_is_told(compile: bool) -> None:  #
         run = simulate(engine(b.build(), compile=compile), [0.0], [1.0], 10.0, METHOD, dt=0.5, torque=[1e99])
     # Half of 1e99 N for 4.5 s on 1 kg is beyond 1e100 m.
     assert run.stats.reached == 4.0
+
+
+@pytest.mark.parametrize("case", cases())
+def test_time_can_be_turned_back(case: str) -> None:
+    model, q, v, duration = cases()[case]
+    model = model.without("damping")
+    dyn, h = engine(model), duration / 100
+    there = simulate(dyn, q, v, duration, METHOD, dt=h, torque=torque_on(model))
+    back = simulate(dyn, there.q[-1], -there.v[-1], duration, METHOD, dt=h, torque=torque_on(model))
+    # 200 steps' rounding, which the motion spreads like any other difference.
+    assert np.abs(model.difference(q, back.q[-1])).max() <= 1e-12
+    assert np.abs(back.v[-1] + v).max() <= 1e-11 * max(np.abs(v).max(), 1.0)

@@ -15,8 +15,24 @@ from mbkit.engines import dynamics
 from mbkit.errors import InputError
 from mbkit.model import Model
 from mbkit.simulate import simulate
-from validation import motions, textbook
+from validation import elliptic, motions, textbook
 from validation.closed_forms import System, published
+
+
+def missed(form: Any, low: float, high: float) -> float:
+    """Return by how much a motion kept each 5 ms misses its turning points: θ̈ h²/8."""
+    return float(max(abs(form.acceleration(low)), abs(form.acceleration(high))) * 0.005**2 / 8)
+
+
+def top() -> tuple[textbook.ReducedTop, np.ndarray, float]:
+    """Return the default heavy top reduced, its ω at the start and the reduced energy; its axis starts at θ = π/2."""
+    w = np.array([0.4, 30.0, -4.6])
+    across, along, weight = 0.234375 + 15.0, 0.46875, 15.0 * 9.81
+    # The axis is the body's y and lies along the world's y; p_φ is about the world's z.
+    form = textbook.ReducedTop(across, along, weight, across * w[2], along * w[1])
+    energy = across * (w[0] ** 2 + w[2] ** 2) / 2
+    return form, w, energy
+
 
 EPS = np.finfo(float).eps
 ENGINES = ("pinocchio", "lagrangian", "mujoco")
@@ -466,3 +482,103 @@ BAD: list[tuple[str, str, Any]] = [
 def test_bad_parameters_are_named(name: str, parameter: str, value: Any) -> None:
     with pytest.raises(InputError, match=rf"^{parameter}: .*expected"):
         catalog.get(name)(**{parameter: value})
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_closed_forms_agree_with_themselves(case: str) -> None:
+    """T is ½ vᵀMv, g and the springs are V's slope, and no power is in the velocity force."""
+    build, form = CASES[case][0], CASES[case][1]()
+    model = build()
+    h = 1e-5
+    for q, v in states(model):
+        M = form.mass_matrix(q)
+        assert form.kinetic_energy(q, v) == pytest.approx(v @ M @ v / 2, rel=50 * EPS, abs=1e-300)
+        springs = form.passive(q) if isinstance(form, textbook.Sprung) else np.zeros(model.nv)
+        for i, e in enumerate(np.eye(model.nv)):
+            up, down = (form.potential_energy(model.integrate(q, x * e)) for x in (h, -h))
+            # Central differences: of V's rounding h is left, of its third derivative h² / 6.
+            scale = max(abs(up), abs(springs).max(), 1.0)
+            assert form.gravity(q)[i] - springs[i] == pytest.approx((up - down) / (2 * h), abs=1e-9 * scale)
+        # Along a velocity field of constant v, d/dt ½ vᵀMv is the power of h = C v.
+        ahead, behind = (form.kinetic_energy(model.integrate(q, x * v), v) for x in (h, -h))
+        power = v @ form.velocity_force(q, v)
+        scale = float(np.linalg.norm(M) * np.linalg.norm(v) ** 3)
+        assert power == pytest.approx((ahead - behind) / (2 * h), abs=1e-9 * max(scale, 1e-300))
+
+
+def test_momenta_of_a_torque_free_spacecraft_stay() -> None:
+    model = catalog.spacecraft_with_wheels(**WHEELS)
+    q, v = states(model, 1)[1]
+    run = simulate(dynamics(model), q, v, 3.0, "rk853", rtol=1e-13)
+    assert run.stats.finished
+    momentum = run.momentum()
+    # About the origin: its angular part holds position × momentum, so the scale is the largest of them.
+    assert np.abs(momentum - momentum[0]).max() <= 1e-12 * np.abs(momentum).max()
+    drift = run.energy() - run.energy()[0]
+    assert np.abs(drift).max() <= 1e-12 * run.energy()[0]
+
+
+def test_reduced_spherical_pendulum_moves_as_the_whole() -> None:
+    model = catalog.spherical_pendulum(length=0.7, mass=1.3)
+    theta, turning, swinging = 0.9, 2.1, 0.6
+    form = textbook.ReducedPendulum(1.3 * 0.7**2 * np.sin(theta) ** 2 * turning, 0.7, 1.3)
+    h = 1e-5
+    slope = (form.effective_potential(theta + h) - form.effective_potential(theta - h)) / (2 * h)
+    assert form.acceleration(theta) == pytest.approx(-slope / (1.3 * 0.7**2), rel=1e-8)
+    assert form.azimuth_rate(theta) == pytest.approx(turning, rel=8 * EPS)
+    energy = 1.3 * 0.7**2 * swinging**2 / 2 + form.effective_potential(theta)
+    low, high = form.limits(energy)
+    for end in (low, high):
+        assert form.effective_potential(end) == pytest.approx(energy, rel=1e-12)
+    # At azimuth 0 and in its plane: α = θ, and β turns with the azimuth.
+    run = simulate(
+        dynamics(model),
+        [theta, 0.0],
+        [swinging, turning * np.sin(theta)],
+        4.0,
+        "rk853",
+        rtol=1e-12,
+        save=np.linspace(0, 4, 801),
+    )
+    cosine = np.cos(run.q[:, 0]) * np.cos(run.q[:, 1])
+    angle = np.arccos(cosine)
+    assert (angle.min(), angle.max()) == pytest.approx((low, high), abs=missed(form, low, high))
+    reduced = solve_ivp(
+        lambda _, y: [y[1], form.acceleration(y[0])], (0, 4), [theta, swinging], method="DOP853", rtol=1e-12, atol=1e-12
+    )
+    assert reduced.y[0, -1] == pytest.approx(angle[-1], abs=1e-10)
+
+
+def test_reduced_top_moves_as_the_whole() -> None:
+    form, w, energy = top()
+    model = catalog.heavy_top()
+    low, high = form.limits(energy)
+    for end in (low, high):
+        assert form.effective_potential(end) == pytest.approx(energy, abs=1e-11 * form.weight)
+    h = 1e-5
+    slope = (form.effective_potential(1.3 + h) - form.effective_potential(1.3 - h)) / (2 * h)
+    assert form.acceleration(1.3) == pytest.approx(-slope / form.across, rel=1e-8)
+    assert form.ignored_rates(np.pi / 2) == pytest.approx((w[2], w[1]), rel=8 * EPS)
+    times = np.linspace(0, 3, 601)
+    run = simulate(dynamics(model), [0.0, 0.0, 0.0, 1.0], w, 3.0, "rk853", rtol=1e-12, save=times)
+    x, y, z, s = run.q.T
+    # The world's z of the body's y.
+    angle = np.arccos(2 * (y * z + x * s))
+    assert (angle.min(), angle.max()) == pytest.approx((low, high), abs=missed(form, low, high))
+    reduced = solve_ivp(
+        lambda _, y: [y[1], form.acceleration(y[0])],
+        (0, 3),
+        [np.pi / 2, -w[0]],
+        method="DOP853",
+        rtol=1e-12,
+        atol=1e-12,
+    )
+    assert reduced.y[0, -1] == pytest.approx(angle[-1], abs=1e-9)
+
+
+def test_limits_of_the_top_are_those_of_the_elliptic_solution() -> None:
+    form, w, energy = top()
+    A = form.across
+    motion = elliptic.Nutation.of(0, w[0], form.p_psi / A, form.p_phi / A, 2 * form.weight / A, w[1])
+    low, high = form.limits(energy)
+    assert (np.cos(high), np.cos(low)) == pytest.approx((float(motion.u1), float(motion.u2)), abs=1e-13)

@@ -579,3 +579,16 @@ def test_a_picture_of_a_four_bar_has_links_that_meet() -> None:
     assert len(drawn.anchors) == 2
     assert not len(drawn.masses)
     run.picture(3)
+
+
+def test_a_heavy_top_keeps_its_vertical_angular_momentum_and_a_cart_pole_its_p() -> None:
+    top = catalog.heavy_top()
+    run = simulate(dynamics(top), top.neutral(), [0.0, 150.0, -4.61538], 0.2, "dop853", rtol=1e-12)
+    L = run.momentum()[:, 3:]
+    assert np.abs(L[:, 2] - L[0, 2]).max() < 1e-9 * np.abs(L).max()
+    assert np.abs(L[:, 0] - L[0, 0]).max() > 1e-2 * np.abs(L).max()
+    cart = simulate(dynamics(catalog.cart_pole()), [0.0, 1.0], [0.5, 0.0], 1.0, "dop853", rtol=1e-12)
+    p = cart.canonical_momentum()
+    assert np.ptp(p[:, 0]) < 1e-10
+    assert p[:, 0] == pytest.approx(cart.momentum()[:, 0], abs=1e-13)
+    assert np.ptp(p[:, 1]) > 1.0

@@ -588,3 +588,29 @@ def test_holonomic_constraints_are_eliminated_by_their_rates(make, way) -> None:
 def test_a_bicycle_is_too_long_to_be_written_out() -> None:
     with pytest.raises(UnsupportedError, match="at most 7 coordinates"):
         mb.lagrangian.from_model(mb.catalog.bicycle())
+
+
+def test_a_ball_on_a_turning_table_goes_in_circles_at_two_sevenths_of_its_rate() -> None:
+    lag = ball()
+    q, v = lag.project([1.0, 0.3, 0.2, 1.4, 0.1], [0.4, -0.1, 0.3, 0.2, 0.5])
+    out = run(lag, q, v, 2.0)
+    turn = 2 / 7 * 1.5
+    # v' = (2/7) Omega z × v.
+    c, d = np.cos(turn * out.t), np.sin(turn * out.t)
+    expected = np.stack([v[0] * c - v[1] * d, v[0] * d + v[1] * c], axis=1)
+    assert out.v[:, :2] == pytest.approx(expected, abs=CLOSE)
+    middle = q[:2] + np.array([-v[1], v[0]]) / turn
+    assert np.linalg.norm(out.q[:, :2] - middle, axis=1) == pytest.approx(np.linalg.norm(v[:2]) / turn, abs=CLOSE)
+
+
+def test_a_disc_keeps_its_steady_motion() -> None:
+    lag, tilt, heading = disc(), 0.3, 1.7
+    # phi' cos θ (phi' (I1 - I3 - m r²) sin θ - psi' (I3 + m r²)) = m g r sin θ (Neimark and Fufaev 1972, ch. VI).
+    spin = ((0.25 - 1.5) * heading * np.sin(tilt) - 9.81 * np.tan(tilt) / heading) / 1.5
+    q = np.array([0.0, 0.0, 0.4, tilt, 0.0])
+    v = np.array([-spin * np.cos(0.4), -spin * np.sin(0.4), heading, 0.0, spin])
+    assert lag.dynamics().forward_dynamics(q, v, np.zeros(5))[2:] == pytest.approx(np.zeros(3), abs=100 * EPS)
+    out = run(lag, q, v, 2.0)
+    assert out.q[:, 3] == pytest.approx(tilt, abs=CLOSE)
+    middle = q[:2] + spin / heading * np.array([np.sin(0.4), -np.cos(0.4)])
+    assert np.linalg.norm(out.q[:, :2] - middle, axis=1) == pytest.approx(abs(spin / heading), abs=CLOSE)

@@ -260,3 +260,79 @@ def test_bad_rest():
     falling = Lagrangian(m * vy**2 / 2, m * g * y, [y], [vy], parameters={m: 1.0, g: 9.81})
     with pytest.raises(NumericalError, match=r"no equilibrium found.*9\.81.*along"):
         equilibrium(falling, [0.0])
+
+
+@pytest.fixture(scope="module")
+def arm():
+    """Two links on springs, with a load in the hand."""
+    q1, q2, u1, u2, l1, l2, m1, m2, load = sp.symbols("q1 q2 u1 u2 l1 l2 m1 m2 load")
+    elbow = [l1 * sp.cos(q1), l1 * sp.sin(q1)]
+    hand = [elbow[0] + l2 * sp.cos(q1 + q2), elbow[1] + l2 * sp.sin(q1 + q2)]
+    return from_particles(
+        [m1, m2],
+        [elbow, hand],
+        [q1, q2],
+        [u1, u2],
+        gravity=[0, -g],
+        potential=20 * (q1**2 + q2**2) / 2,
+        forces=[None, [0, -load]],
+        parameters={l1: 0.5, l2: 0.4, m1: 1.0, m2: 0.5, g: 9.81, load: 5.0},
+        name="arm",
+    )
+
+
+def test_loaded_arm_on_springs(arm):
+    rest = equilibrium(arm, [0.0, 0.0])
+    q1, q2 = rest.q
+    down = 0.5 * 9.81 + 5.0
+    at_elbow = down * 0.4 * np.cos(q1 + q2)
+    assert -20 * q2 == pytest.approx(at_elbow, rel=1e-12)
+    assert -20 * q1 == pytest.approx(at_elbow + (9.81 + down) * 0.5 * np.cos(q1), rel=1e-12)
+    assert rest.stable is True
+    assert rest.residual < 1e-12
+    held = equilibrium(arm, holding=[0.3, -0.2])
+    assert np.allclose(equilibrium(arm, [0.2, 0.0], tau=held.tau).q, [0.3, -0.2], rtol=0, atol=1e-11)
+
+
+def test_frequencies_are_those_of_small_motions(arm):
+    dyn, rest = arm.dynamics(options=OWN), equilibrium(arm, [0.0, 0.0])
+    told = dyn.forward_dynamics_derivatives(rest.q, [0, 0], [0, 0]).q
+    assert np.allclose(rest.frequencies, np.sqrt(np.sort(np.linalg.eigvals(-told))), rtol=1e-12)
+
+
+def test_bead_on_the_hoop_leaves_the_bottom_above_the_threshold():
+    bead = Lagrangian(
+        m * R**2 * (w**2 + Om**2 * sp.sin(th) ** 2) / 2,
+        -m * g * R * sp.cos(th),
+        [th],
+        [w],
+        parameters={m: 1.0, R: 0.7, g: 9.81, Om: None},
+    )
+    threshold = np.sqrt(9.81 / 0.7)
+    for rate in (0.5 * threshold, 0.99 * threshold):
+        bottom = equilibrium(bead.dynamics(options=OWN, Omega=rate), [0.0])
+        assert bottom.stable is True
+        assert bottom.frequencies[0] == pytest.approx(np.sqrt(threshold**2 - rate**2), rel=1e-12)
+    for rate in (1.01 * threshold, 2.0 * threshold):
+        dyn = bead.dynamics(options=OWN, Omega=rate)
+        assert equilibrium(dyn, [0.0]).stable is False
+        side = equilibrium(dyn, [1.3])
+        assert np.cos(side.q[0]) == pytest.approx((threshold / rate) ** 2, rel=1e-12)
+        assert side.stable is True
+        assert side.frequencies[0] == pytest.approx(rate * np.sin(side.q[0]), rel=1e-11)
+    assert equilibrium(bead.dynamics(options=OWN, Omega=threshold), holding=[0.0]).stable is None
+
+
+def test_elastic_pendulum_sags():
+    lag = Lagrangian(
+        m * (vr**2 + r**2 * w**2) / 2,
+        k * (r - ell) ** 2 / 2 - m * g * r * sp.cos(th),
+        [r, th],
+        [vr, w],
+        parameters={m: 2.0, ell: 1.0, g: 9.81, k: 150.0},
+    )
+    rest = equilibrium(lag, [1.0, 0.2])
+    sag = 2.0 * 9.81 / 150.0
+    assert rest.q == pytest.approx([1 + sag, 0.0], abs=1e-13)
+    assert rest.frequencies == pytest.approx([np.sqrt(9.81 / (1 + sag)), np.sqrt(150.0 / 2.0)], rel=1e-12)
+    assert rest.stable is True

@@ -271,3 +271,12 @@ def test_what_is_no_table_of_wrenches_is_named() -> None:
         simulate(dyn, [0.0], [0.0], 1.0, torque=sampled_law, hold=0.1, wrenches=[1.0] * 6)  # type: ignore[arg-type]
     run = simulate(dyn, [0.0], [0.0], 0.0, torque=sampled_law, hold=0.1, wrenches={"m": [1.0] * 6})
     assert run.wrenches()["m"].tolist() == [[1.0] * 6]
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+@pytest.mark.parametrize(("method", "setting"), [("rk4", {"dt": 0.02}), ("rk853", {})])
+def test_friction_takes_f_times_the_way(engine: str, method: str, setting: dict[str, float]) -> None:
+    run = simulate(mb.dynamics(rubbing(), engine), [0.0], [0.5], 2.0, method, torque=[5.0], **setting)
+    # a = (5 - 3)/2, so that 3 m are gone along.
+    assert run.work()[-1] == pytest.approx((5.0 - 3.0) * 3.0, abs=1e-12)
+    assert np.abs(run.power_balance()).max() < 1e-12
