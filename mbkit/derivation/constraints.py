@@ -50,7 +50,7 @@ from mbkit.model.validation import sample_mass_matrix
 #: Of the accelerations along a redundant row: what a stage of a long step leaves on its branch, and no other
 #: branch does.
 OFF_BRANCH: Final = 1e-2
-#: Of a mechanism's size: what a few typed digits leave where ends can meet.
+#: Gap of ends that can meet, relative to the mechanism's size, which a few typed digits leave.
 _MEETS: Final = 1e-9
 #: Height of a disc's centre over its radius below which it lies flat: there its height has a kink, where searches for a
 #: configuration end, and accelerations that grow with its inverse squared have lost 12 digits.
@@ -258,8 +258,8 @@ class Constraints:
 def off_branch(J: Any, gamma: Any, a: Any, force: Any, M: Any) -> Any:
     """Return NaN where accelerations under a force break rows that are redundant where it moves, and else 0."""
     doubt, rest = 0.0, ca.mtimes(J, a) + gamma
-    # What holds the mechanism still leaves the rounding of the free acceleration, in any direction.
-    # What rests accelerates by none of it.
+    # Rows that hold the mechanism still leave the rounding of the free acceleration, in any direction.
+    # A mechanism that rests accelerates by none of it.
     masses = ca.diag(M) * (ca.diag(M) < RESTING)
     masses = ca.fmax(ca.sumsqr(masses), float(np.finfo(float).tiny))
     size, rounding = ca.sumsqr(a), DEPENDENT**2 * ca.sumsqr(force) / masses
@@ -270,7 +270,7 @@ def off_branch(J: Any, gamma: Any, a: Any, force: Any, M: Any) -> Any:
     return doubt
 
 
-# Which rows say something, and which of those are independent: from numbers
+# Rows that say something, and those of them that are independent, from numbers
 
 
 @dataclass(frozen=True)

@@ -299,7 +299,7 @@ class Equations:
         names = FUNCTIONS[name]
         p = self.parameters if self.parameters.numel() else self.constants[: len(self.model.parameters)]
         if name == "forward_dynamics" and not self.model.constrained:
-            # From ID(q, v, FD) = τ, as with the state: never through a factorization.
+            # ID(q, v, FD) = τ gives them, as with the state: never a factorization.
             (by_p,) = ca.substitute([ca.jacobian(self.inverse_dynamics, p)], [self.a], [self.forward_dynamics])
             out = self.over_mass(-by_p)
         else:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-#: What decides the compiled code: packages with all their sub-packages, and single modules, below mbkit's
+#: Modules that decide the compiled code: packages with all their sub-packages, and single modules, below mbkit's
 #: folder. Systems on paper bring equations of their own.
 DECISIVE: Final = (
     "derivation",

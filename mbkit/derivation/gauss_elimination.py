@@ -60,7 +60,7 @@ class Pivot:
     others: dict[int, Any]
     #: The direction in which A drops out, so that the joint's force alone passes.
     free: int | None
-    #: Of the others, the directions of those whose columns are unit vectors, and whose Y_ki are entries of U.
+    #: Directions of the others whose columns are unit vectors, and whose Y_ki are entries of U.
     units: dict[int, int]
 
     def acceleration(self, force: Any, A: Vector, done: Mapping[int, Any]) -> Any:

@@ -153,7 +153,7 @@ def squares(kin: Kinematics) -> Squares:
             rows += [(own.inertia[k][k], angular[k], 0.0) for k in range(3)]
             turned += [(angular[k], torque[k]) for k in range(3) if not is_zero(torque[k])]
     rows += [(rotor, rate, 0.0) for rotor, rate in along_rates(kin, "T")]
-    # What nothing moves is a zero.
+    # A column that nothing moves is zero.
     rows = [row for row in rows if not is_zero(row[0]) and isinstance(row[1], ca.SX)]
     rates = ca.vertcat(ca.SX(0, 1), *(rate for _, rate, _ in rows))
     accelerations = ca.jtimes(rates, kin.q, kin.qdot)
@@ -176,7 +176,7 @@ class LeastConstraint(Elimination):
         for row, i in zip(*squares.jacobian.sparsity().get_triplet(), strict=True):
             columns[i][row] = scalar(squares.jacobian[row, i])
         drifts = dict(enumerate(squares.drifts))
-        #: What the drifts weigh along each column.
+        #: Weight of the drifts along each column.
         self._pulls: list[Any] = [0.0] * len(self._order)
         for place in reversed(range(len(self._order))):
             k = self._order[place]

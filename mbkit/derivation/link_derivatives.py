@@ -184,7 +184,7 @@ class LinkDerivatives:
         self._inherited = [
             (w, to_child(link.fixed, w), to_child(link.rotation, w)) for link, w in zip(self.links, above, strict=True)
         ]
-        #: Of each link, the rows of all joints that it carries.
+        #: Rows of all joints that each link carries.
         self._rows: list[list[Row]] = [[] for _ in self.links]
         self._fold()
 
@@ -247,7 +247,7 @@ class LinkDerivatives:
         """Return ∂/∂q at accelerations `a`, one scalar for each velocity."""
         out: Entries = {}
         inherited, wrenches = self._accelerations(a)
-        #: Of each link, what the coordinates below change in the wrench that it carries.
+        #: Change of the wrench that each link carries, by the coordinates below.
         turned: list[list[tuple[int, Vector]]] = [[] for _ in self.links]
         for index in reversed(range(len(self.links))):
             link, response, wrench = self.links[index], self._responses[index], wrenches[index]

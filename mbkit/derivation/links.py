@@ -174,7 +174,7 @@ class Links:
 
     def __init__(self, kin: Kinematics, *, short: bool = True) -> None:
         self.kin, self._short = kin, short
-        #: Of each link, what its frame is moved by: a turn about z and a slide along it.
+        #: Motion of each link's frame: a rotation about z and a translation along z.
         self._turns: dict[int, Any] = {}
         self._slides: dict[int, Any] = {}
         self._place_links()
@@ -195,9 +195,9 @@ class Links:
 
     def _place_links(self) -> None:
         self.links: list[Link] = []
-        #: Of each link: R_PJ and p_PJ in 120 bits.
+        #: R_PJ and p_PJ of each link in 120 bits.
         self._fixed: list[tuple[Rows, Vector]] = []
-        #: Of each body: its link, and the rotation and translation of the body in it.
+        #: Link of each body, and the rotation and translation of the body in it.
         self._places: dict[str, tuple[int, Rows, Vector]] = {"world": (-1, _IDENTITY, [0.0] * 3)}
         for joint in self.kin.model.tree:
             self._places[joint.child] = self._carry(joint)

@@ -39,7 +39,7 @@ def elimination_size(model: Model) -> int:
     for joint in model.tree:
         part = model.layout.v[joint.mimic.joint if joint.mimic else joint.name]
         moving[joint.child] = moving[joint.parent] | frozenset(range(part.start, part.stop))
-        # Of two velocities that move one body, the later one's row has an entry.
+        # Two velocities that move one body share an entry, in the later one's row.
         for i in moving[joint.child]:
             before[i] |= {j for j in moving[joint.child] if rank[j] <= rank[i]}
     turned = [c for c in model.couplings if c.rotors or any(b.part == c.name for b in model.bindings)]
@@ -225,7 +225,7 @@ class ConstraintTerms:
         masses = masses + _MASSLESS / masses.shape[0] * ca.sum1(masses)
         squares = self.jacobian**2
         heavy, light = ca.mtimes(squares, masses), ca.mtimes(squares, 1 / masses)
-        # Of a row without slope the term is zero.
+        # The term of a row without slope is zero.
         return ca.sqrt((heavy + _TINY) / (light + _TINY)) / (ca.sum2(squares) + _TINY)
 
     def weight(self, M: Any) -> Any:
@@ -301,7 +301,7 @@ class OrthogonalColumns:
         self._scales: list[Any] = []
         self._inverse: list[Any] = []
         self._R: list[dict[int, Any]] = []
-        #: Of the reflections 1 + u w pᵀ.
+        #: Vectors of the reflections 1 + u w pᵀ.
         self._reflections: list[tuple[dict[int, Any], Any, dict[int, Any]]] = []
         for j, u in enumerate(columns):
             own = {i: u.pop(p) for i, p in enumerate(self._pivots) if p in u}

@@ -493,7 +493,7 @@ def mobility(dyn: Dynamics, q: Array | None) -> Mobility:
 #: Configurations near a pose at which J is evaluated too, and how far they are away, rad or m.
 _BESIDE: Final = 4
 _ASIDE: Final = 0.05
-#: Of a row's size beside the pose: its slope where a square is nearly zero.
+#: Slope of a row, relative to its size beside the pose, where a square is nearly zero.
 _FLAT: Final = 1e-4
 #: A slope that is rounding alone.
 _ROUNDED: Final = 1e-14

@@ -31,16 +31,16 @@ LOOSEST: Final = 1e-9
 AHEAD: Final = 4
 #: Steps' ends that decide on one interval.
 _WINDOW: Final = 4
-#: Of the rows' size, 1/s: what typed digits leave of a velocity that is zero.
+#: Largest velocity residual, relative to the rows (1/s), that counts as zero.
 _STILL: Final = 1e-7
-#: Of what γ can be at velocities of this size: its rest at one that stays on a branch to the digits of a loose run.
+#: Rest of γ at a velocity that stays on a branch to a loose run's digits, relative to its size at any velocity.
 _ON_BRANCH: Final = 1e-5
-#: Of the motion's time scale: the difference of times by which J's rate is found.
+#: Difference of times by which J's rate is found, relative to the motion's time scale.
 _APART: Final = 1e-4
 #: Where a step of rk853 has the pose: in the middle of the widest gap between its stages, 1/3 and 0.6.
 _BETWEEN: Final = 7 / 15
-#: Of a step of rk853: how far from a pose it ends at least.
-_CLOSE: Final = 0.45
+#: Least distance of the end of a step of rk853 from a pose, in lengths of the step.
+_END_DISTANCE: Final = 0.45
 
 
 def manifold_at(dyn: Dynamics, t: float) -> Manifold:
@@ -210,14 +210,14 @@ class Approach:
     def length(self, h: float) -> float:
         """Return the length, up to h, of the next step of rk853 with which no stage comes close to a pose ahead."""
         d = float(self.ahead)
-        if not 0.02 * h < d < (1 + _CLOSE) * h:
+        if not 0.02 * h < d < (1 + _END_DISTANCE) * h:
             return h
         # A little longer is better than a short step before it.
-        return d / _BETWEEN if d <= 1.05 * _BETWEEN * h else min(h, d - _CLOSE * h)
+        return d / _BETWEEN if d <= 1.05 * _BETWEEN * h else min(h, d - _END_DISTANCE * h)
 
     def ends_close(self, h: float) -> bool:
         """Return whether a step of rk853 of this length would end close to a pose."""
-        return bool(abs(float(self.ahead) - h) < _CLOSE * h)
+        return bool(abs(float(self.ahead) - h) < _END_DISTANCE * h)
 
 
 def _time_ahead(dyn: Dynamics, t: float, q: Array, v: Array) -> Array:

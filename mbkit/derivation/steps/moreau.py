@@ -28,7 +28,7 @@ from mbkit.model.parts import RESTING
 STATE: Final = ("q", "w", "side", "still", "k", "end", "best", "left", "go")
 #: Attempts that may not have fewer failures before sides are changed one by one.
 PATIENCE: Final = 3
-#: Of `best`, more than all velocities.
+#: `best` beyond every velocity: no candidate yet.
 MANY: Final = 1e9
 
 
@@ -64,7 +64,7 @@ def moreau_parts(equations: Equations, which: list[int], sides: list[str], locks
         return ca.vertcat(side, lock, *at_step)[order]
 
     def solve() -> ca.Function:
-        # What comes to rest is accelerated so that it has no velocity at the end: a force on a giant rotor.
+        # A joint that comes to rest is accelerated so that it has no velocity at the end: a force on a giant rotor.
         target = -ca.mtimes(pick, v) / h
         force = s["tau"] + ca.vertcat(spread(RESTING * still * target), ca.SX(s["tau"].numel() - nv, 1))
         forward = equations.function("forward_dynamics")

@@ -49,7 +49,7 @@ def phase_margin(equations: Equations, which: Sequence[int], sides: Sequence[str
         if model.constrained:
             moved = _ways(equations, which)(q, ca.vertcat(*values))
             used = _shared(ca.mtimes(pick, moved), ca.mtimes(moved.T, needed), bound, still, locked)
-            # What rows alone hold moves as soon as they do.
+            # A joint that rows alone hold moves as soon as they do.
             size = reduce(ca.fmax, ca.vertsplit(ca.fabs(ends)), ca.SX(1.0))
             left = choose(locked, 1.0, 1 - ca.fabs(ca.mtimes(pick, ends)) / (POSE_ROUNDING * size))
             left = ca.fmin(1 + ROUNDING - used, left)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 #: Every joint acts.
 LEAST: Final = "least"
-#: Of a row's size times the acceleration's: what rounding and a few typed digits leave of a consistent one.
+#: Residual of a consistent row by rounding and a few typed digits, relative to its size times the acceleration's.
 _CONSISTENT: Final = 1e-8
 _OF_A_TREE: Final = "inverse_dynamics(q, v, a) is the force of the joints of a tree"
 ACTUATOR_FORCES: Final = Path("actuator forces", "actuator_forces: not known of", ALL, asks=ASKED, instead=_OF_A_TREE)

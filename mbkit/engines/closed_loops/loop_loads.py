@@ -28,7 +28,7 @@ from mbkit.model.elements.paths import Path
 from mbkit.model.loops import LOOP_KINDS, LOOP_ROWS, LoopEnds
 from mbkit.model.parts import Loop
 
-#: Of the forces' size: their rest after the constraints' own, up to which a motion is that of a force.
+#: Rest of forces after the constraints' own, relative to their size, up to which a motion is that of a force.
 _MEANT: Final = 1e-8
 LOOP_LOADS: Final = Path(
     "loads of loops", "", LOADS.carries, LOADS.why, asks=(frozenset(f"loop.{x}" for x in LOOP_KINDS), "it has no loops")
@@ -140,7 +140,7 @@ class LoopLoads(Actuation, Loads):
         """Return rows of an answer; an engine that keeps more digits keeps those of the rows."""
         return out[..., first:last, :]
 
-    # From an engine's own terms, at one state.
+    # They come from an engine's own terms, at one state.
 
     def _loads_under_force(self, q: Array, v: Array, tau: Array, *given: Any) -> Array:
         pushed = self._generalized_force(q, given[0], *given[2:]) if len(given) > 3 else 0.0
@@ -199,7 +199,7 @@ class LoopLoads(Actuation, Loads):
             out.append(np.concatenate([force, moment]))
         return out
 
-    # What is not determined
+    # Loads that are not determined
 
     def undetermined_loads(self, q: ArrayLike) -> UndeterminedLoads:
         """Return which components of loads the laws of rigid bodies do not determine at a pose.
@@ -254,7 +254,7 @@ class LoopLoads(Actuation, Loads):
     def _strained(self, X: dict[str, Array], shares: Array) -> Iterator[Array]:
         """Yield what forces in the loops, in balance with each other, add to the load of each joint and loop."""
         model, own, first = self.model, [], 0
-        #: Of all that a body carries, about the world's origin.
+        #: Wrench of all that a body carries, about the world's origin.
         total = {name: np.zeros(6) for name in X}
         for k, loop in enumerate(model.loops):
             last = first + len(LOOP_ROWS[loop.kind][0])

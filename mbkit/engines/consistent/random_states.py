@@ -26,9 +26,9 @@ _HALF, _WHOLE = 12, 8
 #: velocity may become, too, which tells of joints that nearly lock.
 _BESIDE_START: Final = 1e-7
 _SLOPE: Final = 30.0
-#: Of the apartness of rows at a closed configuration that is known, the least at a random one.
+#: Least apartness of rows at a random configuration, relative to that at a closed one that is known.
 _WELL: Final = 0.3
-#: Of each row's size: what Newton's last step may have left.
+#: Residual that Newton's last step may leave, relative to each row's size.
 _REACHED: Final = 1e-12
 
 

@@ -203,7 +203,7 @@ class DryFriction(AddedForce):
                     return self._in_phase(quantity, dyn, q, v, tau, rest, resting)
                 held, still = self._each(dyn, quantity, moving, q, v, tau, rest, resting)
                 out = moving(q, v, tau + padded(held, tau), *rest)
-                # What friction holds does not move, not even by a rounding.
+                # A joint that friction holds does not move, not even by a rounding.
                 return np.where(still, 0.0, out) if quantity.startswith(_FORWARD) else out
 
             return pushed

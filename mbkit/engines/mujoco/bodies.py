@@ -221,7 +221,7 @@ class MujocoBodies(MovingFrames, Composed):
         bodies = self._maps.bodies
         out = {b.name: self._held(bodies[b.name]) if b.name in bodies else np.zeros(6) for b in self.model.bodies}
         for joint in reversed(self.model.tree):
-            # What hangs on a body that is fixed to the world hangs on the world itself in MuJoCo's model.
+            # A body on one that is fixed to the world hangs on the world itself in MuJoCo's model.
             apart = joint.child not in bodies or not self._m.body_parentid[bodies[joint.child]]
             if apart and joint.parent in out:
                 out[joint.parent] += out[joint.child]

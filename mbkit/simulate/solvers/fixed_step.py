@@ -33,7 +33,7 @@ def to_body_velocity(space: Space, q: Array, w: Array) -> Array:
     if space.flat:
         return w
     flat = (np.ascontiguousarray(x).reshape(-1, x.shape[-1]) for x in (q, w))
-    # What a lost state has become is nobody's concern here.
+    # Values of a lost state do not matter here.
     with np.errstate(over="ignore", invalid="ignore"):
         return np.asarray(space.to_body_velocity(*flat).reshape(w.shape))
 
@@ -251,7 +251,7 @@ def make_step(method: str, field: Field, space: Space) -> Step:
         try:
             q1, w1 = attempt(t, h, q, w, force)
         except DivergenceError:
-            # Of a batch each is then asked by itself.
+            # Each member of a batch is then asked by itself.
             if q.size > q.shape[-1]:
                 raise
             return near_pose(t, h, q, w, force)

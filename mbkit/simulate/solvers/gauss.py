@@ -227,7 +227,7 @@ class StepNearPose:
         try:
             return self._collocation(t, h, q, w, force)
         except DivergenceError:
-            # Of a batch each is then asked by itself.
+            # Each member of a batch is then asked by itself.
             if not splits or q.size > q.shape[-1]:
                 raise
         finally:

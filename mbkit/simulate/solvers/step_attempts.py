@@ -83,8 +83,6 @@ class StepAttempts(Protocol):
 
 #: Tightest tolerance of a step across a singular pose, which rounding lets a step of rk853 hold.
 _MIN_RTOL_ACROSS_POSE: Final = 1e-13
-
-
 #: Part of the velocity that is rounding in stages of collocation at the shortest distance of a stop from a pose.
 _STAGES_NEAR_POSE: Final = 1e-7
 

@@ -42,7 +42,7 @@ _SET_UP: Final = 2**10
 _MOST_STATES: Final = 2**16
 #: Fraction of a step before which the end of a phase is not searched.
 _FROM: Final = 1e-6
-#: Of a time, what is left of a step whose phase ends with it.
+#: Rest of a step, relative to the time, whose phase ends with it.
 _TIMES: Final = 4 * EPS
 
 
@@ -56,7 +56,7 @@ def run_fixed_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics]
         try:
             return _together(problem, [_Members(problem, every, solver, side_by_side=True)])
         except NumericalError:
-            # Of one state: the others have nothing to do with it.
+            # One state failed: the others have nothing to do with it.
             pass
     return _together(problem, [_Members(problem, every[i : i + 1], solver, side_by_side=False) for i in every])
 
@@ -126,7 +126,7 @@ class _Members:
             self._going &= self.k < grid.steps
             self.problem.bar.update((self.members[0] / len(self.k) + self.k.mean() / grid.steps) / parts)
 
-    # What acts
+    # Forces
 
     def _sample(self, rows: Indices) -> None:
         """Ask a torque that samples for its value, in the states of those who are hindmost."""
@@ -385,7 +385,7 @@ class _Members:
             why = f"{UNDECIDED} at t = {time:.9g} s: their phases end where they begin"
             self.early[int(self.members[i])] = "step_too_small", why
         self.q[rows], self.v[rows] = state[0], v
-        # What let go and came to rest at once did not let go.
+        # A joint that let go and came to rest at once did not let go.
         after = self.begin(rows, self.times(later), leaving * (moved | pushed)[:, None])
         for i, name in self.friction.changes(before, after):
             if decided[i]:
@@ -417,7 +417,7 @@ class _PartOfStep:
         self._run, self._rows, self.phase, self._t = run, rows, phase, t
         self._force = run.forces(rows)
         self._method = method_of(run.problem.method)
-        #: What a step reads of its parameters, where it is machine code with the margins of its end.
+        #: Parameters that a step reads, where it is machine code with the margins of its end.
         self._values: Array | None = None
         dyn: Any = phase.dyn
         timed = dyn.model.time_parameter
@@ -461,7 +461,7 @@ class _PartOfStep:
         early = np.flatnonzero(soon <= -noise)
         if len(early):
             now[early] = self.ahead(i[early], 0 * length[early])[2]
-        # What rests at its bound to the last bits, and is pulled more and more, lets go in the next instant.
+        # A joint that rests at its bound to the last bits, and is pulled more and more, lets go in the next instant.
         at_once = soon <= -noise
         low, high = np.where(at_once, 0.0, first), np.where(at_once, first, length)
         # A speed that is zero at the end may have faded out long before.

@@ -44,7 +44,7 @@ def run_moreau(problem: IntegrationProblem) -> SolverResult:
             record.good[:], record.evaluations = steps, attempts
             problem.bar.update(1.0)
             return record.result()
-        # Of one state: the others have nothing to do with it.
+        # One state failed: the others have nothing to do with it.
     for i in every.tolist():
         member = problem.member(i)
         own = dyn if member is None else dyn._of_sample(i)
@@ -62,7 +62,7 @@ def run_moreau(problem: IntegrationProblem) -> SolverResult:
 class _InPython:
     """The steps of one trajectory, or of several side by side, each as a problem of impulses with bounds."""
 
-    #: Of a torque function that failed.
+    #: Error of a torque function that failed.
     error: FunctionError | None = None
 
     def __init__(
@@ -127,7 +127,7 @@ class _InPython:
         if self._rubs.any():
             slides = np.abs(self._law.force_at(v))
             rests = v == 0
-            # What stops or turns may be held by its stiction.
+            # A joint that stops or turns may be held by its stiction.
             while True:
                 most = h * np.where(rests, self._law.bound, slides)
                 given = inverse, smooth, most, h * slides, self._rubs, np.zeros(v.shape)

@@ -160,7 +160,7 @@ class Friction:
             used = np.abs(self.holding(phase, t, q, held, force)[..., self.which]) / np.where(still, bound, 1.0)
             out = np.where(still, 1 + ROUNDING - used, out)
             if self._bound:
-                # What rows alone hold moves as soon as they do.
+                # A joint that rows alone hold moves as soon as they do.
                 moved = np.abs(v) / slow(v)
                 out = np.where(still & ~phase.locked[..., self.which], np.minimum(out, 1 - moved[..., self.which]), out)
         return out

@@ -37,7 +37,7 @@ def run_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics], Solv
         try:
             _adaptive(run)
         except FunctionError as error:
-            # Of a torque that is asked whether a phase ends.
+            # A torque function failed while it was asked whether a phase ends.
             run.record.fail(error)
         except NumericalError as error:
             run.record.stop(diverged(str(error)))
@@ -85,7 +85,7 @@ class _Member:
             self.record.message = f"{UNDECIDED} at t = {t:.9g} s: their phases end where they begin"
             return None
         self.q, self.v = q, v
-        # What let go and came to rest at once did not let go.
+        # A joint that let go and came to rest at once did not let go.
         out = self.begin(k, t, leaving if moved else None)
         for _, name in self.friction.changes(phase, out):
             self.record.events.append(Hit(name, t, self.q.copy(), self.v.copy(), self.member))
