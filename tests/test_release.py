@@ -101,7 +101,7 @@ def test_parts_are_listed_and_chosen_by_name():
     listed = run("--list")
     assert listed.returncode == 0
     assert [line.split()[0] for line in listed.stdout.splitlines()] == list(PARTS)
-    unknown = run("--only", "nothing")
+    unknown = run("nothing")
     assert unknown.returncode == 2
     assert "accuracy" in unknown.stderr
 

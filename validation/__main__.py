@@ -1,7 +1,7 @@
 """Measure everything again: every file and figure that the pages of numbers are made of.
 
-``python -m validation`` runs all parts, one after the other, in about three hours on two cores; ``--only NAME``, more
-than once if wanted, runs some; ``--list`` names them. A part that fails does not stop the others. With ``--smoke`` each
+``python -m validation`` runs all parts, one after the other, in about three hours on two cores; with names of
+parts it runs these; ``--list`` names them all. A part that fails does not stop the others. With ``--smoke`` each
 runs with little of everything, and nothing is kept: `validation.smoke`.
 """
 
@@ -88,16 +88,18 @@ PARTS = {
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m validation", description=__doc__.splitlines()[0])
-    parser.add_argument("--only", action="append", choices=PARTS, metavar="NAME", help="run this part; may be repeated")
+    parser.add_argument("parts", nargs="*", metavar="PART", help="run these parts (default: all of them)")
     parser.add_argument("--smoke", action="store_true", help="with little of everything, in seconds; nothing is kept")
     parser.add_argument("--list", action="store_true", help="name the parts and end")
     asked = parser.parse_args()
+    if unknown := [x for x in asked.parts if x not in PARTS]:
+        parser.error(f"no part is called {unknown[0]!r}; the parts are {', '.join(PARTS)}")
     if asked.list:
         for name, part in PARTS.items():
             print(f"{name:20} {part.minutes:3.0f} min  {part.about}")
         return 0
     failed = []
-    for name in asked.only or PARTS:
+    for name in asked.parts or PARTS:
         print(name if asked.smoke else f"{name}: about {PARTS[name].minutes:g} min", flush=True)
         begun = time.perf_counter()
         run = ["validation.smoke", name] if asked.smoke else [f"validation.{name}"]

@@ -38,7 +38,7 @@ def origin(data: dict[str, Any], part: str) -> Markdown:
     told += [", ".join(f"{name} {found[name]}" for name in NAMED if name in found and found[name] != "not installed")]
     told += [lanes(data)] if part in SIMD else []
     told += [changed(data)]
-    return Markdown(f"*{'; '.join(x for x in told if x)}. Again: `python -m validation --only {part}`.*")
+    return Markdown(f"*{'; '.join(x for x in told if x)}. Again: `python -m validation {part}`.*")
 
 
 def lanes(data: dict[str, Any]) -> str:

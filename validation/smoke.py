@@ -2,7 +2,7 @@
 
 Each script has a dict `SMOKE`: names of its constants, or dotted ones of another script, and what stands for them here;
 variables of the environment too.
-``python -m validation --smoke [--only NAME]`` runs the parts so, and ``tests/test_validation.py`` all of them. What is
+``python -m validation --smoke [PART ...]`` runs the parts so, and ``tests/test_validation.py`` all of them. What is
 written goes into a folder of its own, and is thrown away.
 """
 
