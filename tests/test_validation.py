@@ -15,7 +15,7 @@ from validation.pages import LEVELS, SIMD, lanes, origin
 KEPT = Path(stamp.__file__).parent
 STAMP = {"date", "versions", "processor", "simd", "code"}
 #: Written into a file by whoever measured.
-BY_HAND = {"matrix.json": {"note"}, "gpu.json": {"left out", "remarks"}, "derivation.json": {"python"}}
+BY_HAND = {"gpu.json": {"left out", "remarks"}, "derivation.json": {"python"}}
 
 
 @pytest.mark.parametrize("name", PARTS)
