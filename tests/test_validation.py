@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mbkit.codegen import jit
-from validation import smoke, stamp, thresholds
+from validation import matrix, smoke, stamp, thresholds
 from validation.__main__ import PARTS
 from validation.pages import LEVELS, SIMD, lanes, origin
 
@@ -26,6 +26,14 @@ def test_a_part_runs_and_writes_what_is_kept(name: str, tmp_path: Path, monkeypa
         assert wanted <= set(data), file
         assert stamp.changed(data.get("made", data)) == ""
     assert all((tmp_path / x).is_file() for x in PARTS[name].writes)
+
+
+def test_the_matrix_counts_mutations(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in matrix.SMOKE.items():
+        monkeypatch.setattr(matrix, name, value)
+    found = matrix.mutations()
+    assert [*found] == ["dropped", "admitted", "removed"]
+    assert all(x["mutants"] and not x["survive"] for x in found.values())
 
 
 SCRIPT = '''"""Says what it does."""

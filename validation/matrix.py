@@ -80,8 +80,8 @@ def mutations() -> dict[str, Any]:
     cells = json.loads(results("matrix.json").read_text(encoding="utf-8"))["rows"]
     right = {(r["kind"], path) for r in cells for path, c in r["cells"].items() if c[0] == "right"}
     out: dict[str, Any] = {}
-    for mutation in kind_mutations.MUTATIONS:
-        paths = PATHS if mutation == "removed" else sorted(set(registered()) - {*kind_mutations.ELSEWHERE})
+    for mutation in ("dropped", "admitted", "removed"):
+        paths = PATHS if mutation == "removed" else sorted(set(registered()) - {*kind_mutations.ELSEWHERE})[::EACH]
         found = out[mutation] = {"paths": len(paths), "left_out": [], "mutants": 0, "survive": {}}
         for path in paths:
             names = [name for name in KINDS if mutation != "removed" or (name, path) in right]
