@@ -540,7 +540,7 @@ def test_the_command_prints_and_writes(study, here, monkeypatch):
     page = (folder / "stress.html").read_text(encoding="utf-8")
     assert 'href="stress.csv"' in page
     assert "<h1>Stiff and extreme" in page
-    assert "How to read the maps" in page
+    assert "how to read the tables" in page
     one = replace(study, cases=study.cases[:1], complete=False)
 
     def stopped(*_: object, **__: object) -> None:

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Final
 from mbkit._escape import terminal
 from mbkit.studies.document import Document, Span, spans
 from mbkit.studies.formatting import count_text, error_text, time_text
-from mbkit.studies.stress.view import FILTERS
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -28,9 +27,9 @@ _MIN_LONG_LETTERS: Final = 60
 def render(shown: Document, *, data: str = "", table: str = "", when: datetime | None = None) -> str:
     """Return a document as a page; `data` and `table` are the JSON and CSV files beside it, `when` its date."""
     stamp = (when or datetime.now().astimezone()).strftime("%Y-%m-%d %H:%M:%S %Z").strip()
-    template = _environment().get_template(shown.template)
+    template = _environment().get_template("document.html")
     names = {"data": data, "table_file": table, "script": _script(), "digest": _digest()}
-    return template.render(shown=shown, result=shown.result, when=stamp, **names, **shown.content())
+    return template.render(shown=shown, result=shown.result, when=stamp, **names)
 
 
 @cache
@@ -66,7 +65,6 @@ def _environment() -> Environment:
         kind=lambda block: type(block).__name__,
         cellsize=_cellsize,
         markup=Markup,
-        **FILTERS,
     )
     return environment
 

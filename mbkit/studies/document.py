@@ -180,8 +180,7 @@ class Document:
     A terminal has `name` before the verdict and `summary` below it, or the verdict at the end (`last`); a page has a
     heading and, in the browser's bar, a title, which are the name by default, and `sentence` for the verdict: it also
     says on how many states, and against what. `marked`: the verdict is a judgement, with ✓ or ✗. At the foot of the
-    page stand `basis` and the result's `versions`, `processor` and `seconds`. A page with tables of its own names its
-    template, and its content.
+    page stand `basis` and the result's `versions`, `processor` and `seconds`.
     """
 
     name: str
@@ -197,8 +196,6 @@ class Document:
     opening: Sequence[Block] = ()
     basis: Mapping[str, Text] = field(default_factory=dict)
     last: bool = False
-    template: str = "document.html"
-    content: Callable[[], Mapping[str, Any]] = dict
 
     def shown(self, where: On) -> Iterator[tuple[Section, list[Block]]]:
         """Yield the sections that have something to show there."""

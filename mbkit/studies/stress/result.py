@@ -1,40 +1,51 @@
-"""The result of `stress`: for each engine and method, how far it held and how it failed."""
+"""The result of `stress`, and the document that shows how far each engine and method held and how it failed."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from operator import attrgetter
+from functools import partial
+from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 
 from mbkit._check import real
 from mbkit.errors import require_known
+from mbkit.studies import document as doc
 from mbkit.studies.document import Bullet, Column, Document, Items, Paragraph, Section, Span, Table
 from mbkit.studies.formatting import setting_words, time_text
 from mbkit.studies.measurement import Measurement, Outcome
 from mbkit.studies.results import NO_LIMIT, ResultTable, columns, counted
-from mbkit.studies.stress.figure import figure
-from mbkit.studies.stress.measurements import Breaking, CaseResult, Row, name_of, overviews
-from mbkit.studies.stress.view import (
-    avoid,
-    content,
-    first_failure,
-    held_text,
-    leader_text,
-    leaders,
-    places_text,
-    reached_text,
-)
+from mbkit.studies.stress.figure import WORDS, cell_text, figure, number_text, shade
+from mbkit.studies.stress.measurements import UNKNOWN, Breaking, CaseResult, Line, Row
 from mbkit.studies.study_runs import OUT_OF_TIME
+from mbkit.studies.svg import PAGE, page_style, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: A terminal names so many methods that were wrong in silence.
+#: A terminal names so many methods that were wrong in silence, and so many cases of each.
 _MAX_SILENT_METHODS: Final = 6
+_MAX_PLACES: Final = 2
+#: Names in one sentence; the tables have all.
+_MAX_NAMES: Final = 3
+#: The words before a truth's floor.
+_KNOWN: Final = "; known to "
+_MEASURES: Final = {
+    "motion": "the largest difference of q along the run, over the size of the motion",
+    "energy": "the largest relative error of the energy along the run",
+    "terms": "that of each term at the case's states, relative to the term",
+}
+_KEY: Final = (
+    "A row is one engine and method, a column one value; the furthest row stands first. A number is the error: blue "
+    "where it held, orange where it is inaccurate, the darker the fewer digits, by steps of 12, 9, 6 and 3. Red is "
+    "wrong by more than a hundredth of the motion or term: ! with a warning, ✗ in silence. Grey ended otherwise, dark "
+    "grey without a word; ? finished, and the truth is not known well enough; empty was not run. The first value that "
+    "did not hold begins at a thick line. Run time is the median where it held."
+)
 
 
 @dataclass(frozen=True)
@@ -147,59 +158,42 @@ class StressResult(ResultTable):
         stopped = "interrupted; what was finished: "
         if self.complete:
             stopped = f"{self.left_out}; " if self.left_out else ""
-        if all(cell.end == "not run" for _, row in self.rows() for cell in row.cells):
+        if all(item.cell.end == "not run" for item in self._csv_rows()):
             return f"{stopped}nothing was run"
-        counts = [[c.outcome(case.bar) for row in case.rows for c in row.cells].count("silent") for case in self.cases]
-        silent = f"{sum(counts)} silent failure{'s' * (sum(counts) != 1)} in {counted(sum(map(bool, counts)), 'case')}"
-        return f"{stopped}{leaders(overviews(self.cases))}; {silent if sum(counts) else 'no silent failures'}"
+        counts = [n for n in map(_silent_count, self.cases) if n]
+        silent = f"{counted(sum(counts), 'silent failure')} in {counted(len(counts), 'case')}"
+        return f"{stopped}{_leaders(self.cases)}; {silent if counts else 'no silent failures'}"
 
     def document(self, *, full: bool = True) -> Document:
-        """Return the document of the study; `full` has how far each engine and method held in every case."""
-        cases = overviews(self.cases)
-        runs = sum(cell.end != "not run" for _, row in self.rows() for cell in row.cells)
-        behind_or_not = {True: Span("behind", "allowed"), False: Span("✓", "good")}
-        auto = [Column("auto", lambda o: behind_or_not[o.behind] if o.choice else Span("", "good"), fill=True)]
-        columns = (
-            Column("case", lambda o: o.case.name, most=22, fill=True),
-            Column("furthest", leader_text, most=24, fill=True),
-            Column("held to", lambda o: reached_text(o.leader) if o.leader else "", fill=True),
-            *(auto if any(o.choice for o in cases) else []),
-            Column("✗", lambda o: Span(str(sum(x.outcomes.count("silent") for x in o.lines) or ""), "bad"), right=True),
-            Column("first to break", lambda o: Span(first_failure(o), "muted"), fill=True),
+        """Return the document of the study; `full` has the rows of every case beyond the page, too."""
+        runs = sum(item.cell.end != "not run" for item in self._csv_rows())
+        silent, study = _silent_bullets(self.cases), f"{runs} runs of {counted(len(self.cases), 'case')}"
+        chosen = any(case.choice for case in self.cases)
+        shown = [c for c in _CASES if chosen or c.head != "auto"]
+        drawn = doc.Figure(
+            lambda: _drawn(self.cases), "How much of each sweep held: of each engine its furthest method."
         )
-        behind = [
-            Bullet(
-                o.case.name,
-                f"auto {held_text(o.choice)}, {name_of(o.lines[0].row)} {held_text(o.lines[0])}",
-                "!",
-                "allowed",
-            )
-            for o in cases
-            if o.behind and o.choice is not None
-        ]
-        silent = [Bullet(a.method, places_text(a), "✗", "bad") for a in avoid(cases)]
+        key = doc.Details("how to read the tables", [Paragraph(_KEY)])
         return Document(
             name="stress",
             heading="Stiff and extreme: where each engine and method breaks",
             title="Stiff and extreme",
             verdict=self.headline,
-            sentence=f"{self.headline}; {runs} runs of {counted(len(cases), 'case')}, each against a known truth",
+            sentence=f"{self.headline}; {study}, each against a known truth",
             good=bool(self.complete and self.cases and not silent),
             marked=False,
-            summary=f"{len(cases)} cases · {runs} runs · {time_text(self.seconds)}",
+            summary=f"{len(self.cases)} cases · {runs} runs · {time_text(self.seconds)}",
             sections=[
-                Section("Who holds furthest, and what breaks first", [Table(columns, cases)]),
-                Section("Where another held further than auto", [Items(behind)]),
+                Section("Who holds furthest, and what breaks first", [Table(shown, self.cases), drawn, key]),
+                Section("Where another held further than auto", [Items(list(_behind_bullets(self.cases)))]),
                 Section("Wrong in silence, and the mildest value where", [Items(silent, most=_MAX_SILENT_METHODS)]),
-                *(map(_rows_of, self.cases) if full else ()),
+                *(_case_section(case, "both" if full else "page") for case in self.cases),
             ],
             result=self,
             basis={
                 name: f"{value / 2**30:g} GiB" if name == "memory" and value else setting_words(value)
                 for name, value in self.settings.items()
             },
-            template="stress.html",
-            content=lambda: content(cases),
         )
 
     def plot(self, case: str | None = None, ax: Axes | None = None) -> Figure:
@@ -219,14 +213,157 @@ def _bar(case: CaseResult, other: float | None) -> float:
     return case.bar if other is None else real("bar", other, positive=True)
 
 
-def _rows_of(case: CaseResult) -> Section:
-    """Return how far each engine and method held in a case, the furthest first."""
-    ranked = sorted(case.rows, key=lambda row: -row.reach(case.bar))
-    columns = (
-        *(Column(name, attrgetter(name)) for name in ("engine", "method", "setting")),
-        Column(f"held to {case.unit}".rstrip(), lambda b: "none" if b.held is None else f"{b.held:g}", right=True),
-        Column("then", lambda b: "" if b.failed is None else f"{b.failed:g}", right=True),
-        Column("how", attrgetter("how")),
-    )
-    about = Paragraph(f"{case.about} Held: error ≤ {case.bar:g}.")
-    return Section(case.name, [about, Table(columns, [row.breaking(case.bar, case.name) for row in ranked])])
+def _drawn(cases: Sequence[CaseResult]) -> str:
+    with page_style("stress"):
+        return svg(figure(cases, palette=PAGE), "How much of each sweep every engine's furthest method held")
+
+
+# Sentences
+
+
+def _value_text(x: float, case: CaseResult) -> str:
+    return number_text(x) + (f" {case.unit}" if case.unit and math.isfinite(x) else "")
+
+
+def _reached(line: Line, case: CaseResult) -> str:
+    if line.reach == len(case.values) > 0:
+        return "all"
+    return _value_text(line.row.cells[line.reach - 1].value, case) if line.reach else "nothing"
+
+
+def _leaders(cases: Iterable[CaseResult]) -> str:
+    """Return what held furthest in most cases; terms and steps, which ask for stability alone, rank no method."""
+    ran = [case for case in cases if case.rows]
+    ranked = [case for case in ran if case.measure != "terms" and case.family != "step"] or ran
+    counts = Counter(name for case in ranked for name in case.unbeaten)
+    if not counts:
+        return f"nothing held in {counted(len(ranked), 'case')}"
+    most = max(counts.values())
+    names = [name for name, count in counts.items() if count == most]
+    if len(names) > _MAX_NAMES:
+        names = [*names[:_MAX_NAMES], f"{len(names) - _MAX_NAMES} more"]
+    listed = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+    return f"{listed} held furthest, or as far as any, in {most} of {counted(len(ranked), 'case')}"
+
+
+def _behind(case: CaseResult) -> bool:
+    """Return whether another line held further than mbkit's own choice."""
+    return case.choice is not None and case.choice.reach < max(line.reach for line in case.best.values())
+
+
+def _behind_bullets(cases: Iterable[CaseResult]) -> Iterator[Bullet]:
+    for case in filter(_behind, cases):
+        assert case.choice is not None
+        held = [_reached(line, case) for line in (case.choice, case.lines[0])]
+        held = [f"held {'' if text in ('all', 'nothing') else 'to '}{text}" for text in held]
+        yield Bullet(case.name, f"auto {held[0]}, {case.lines[0].row.name} {held[1]}", "!", "allowed")
+
+
+def _silent_count(case: CaseResult) -> int:
+    return sum(line.outcomes.count("silent") for line in case.lines)
+
+
+def _silent_bullets(cases: Iterable[CaseResult]) -> list[Bullet]:
+    """Return the methods that were wrong in silence, with the mildest value of each case; the most often so first."""
+    where: dict[str, dict[int, tuple[CaseResult, int]]] = {}
+    for k, case in enumerate(cases):
+        for line in (x for x in case.lines if "silent" in x.outcomes):
+            places = where.setdefault(line.row.name if case.measure == "terms" else line.row.method, {})
+            first = line.outcomes.index("silent")
+            places[k] = case, min(first, places.get(k, (case, first))[1])
+    out = []
+    for method, found in sorted(where.items(), key=lambda item: -len(item[1])):
+        texts = [f"{c.name} at {c.parameter} = {_value_text(c.values[at], c)}" for c, at in found.values()]
+        more = [f"{len(texts) - _MAX_PLACES} more"] if len(texts) > _MAX_PLACES else []
+        out.append(Bullet(method, ", ".join(texts[:_MAX_PLACES] + more), "✗", "bad"))
+    return out
+
+
+# Columns
+
+
+def _leader(case: CaseResult) -> str:
+    if case.leader is None:
+        return "none ran"
+    row = case.leader.row
+    return f"{row.engine} (terms)" if case.measure == "terms" else row.name
+
+
+def _auto(case: CaseResult) -> doc.Text:
+    if case.choice is None:
+        return ""
+    return Span("behind", "allowed") if _behind(case) else Span("✓", "good")
+
+
+def _first_failure(case: CaseResult) -> str:
+    """Return which row is the first that is of no use, and how."""
+    ended = [x for x in case.lines if not x.left_out and (*x.outcomes, "not run")[x.usable] not in UNKNOWN]
+    if not ended:
+        return ""
+    line = min(ended, key=lambda x: x.usable)
+    how = line.outcomes[line.usable]
+    return f"{number_text(line.row.cells[line.usable].value)} {WORDS.get(how, how)}: {line.row.name}"
+
+
+_CASES: Final = (
+    Column("case", attrgetter("name"), most=22, fill=True),
+    Column("furthest", _leader, most=24, fill=True),
+    Column("held to", lambda case: _reached(case.leader, case) if case.leader else "", fill=True),
+    Column("auto", _auto, fill=True),
+    Column("✗", lambda case: Span(str(_silent_count(case) or ""), "bad"), right=True),
+    Column("first to break", lambda case: Span(_first_failure(case), "muted"), fill=True),
+)
+
+
+def _case_section(case: CaseResult, on: doc.On) -> Section:
+    """Return how far each engine and method held in a case, on a page with every cell."""
+    columns = [
+        *(Column(name, attrgetter(f"row.{name}")) for name in ("engine", "method", "setting")),
+        Column(f"held to {case.unit}".rstrip(), lambda x: _plain(x.broken.held, "none"), right=True),
+        Column("then", lambda x: _plain(x.broken.failed), right=True),
+        Column("how", lambda x: WORDS.get(x.broken.how, x.broken.how)),
+        *(Column(number_text(value), partial(_cell, k=k), on="page") for k, value in enumerate(case.values)),
+        Column("linear\ntheory", lambda x: _number(x.row.theory), right=True, on="page"),
+        Column("run time", lambda x: Span(time_text(x.seconds), "muted"), right=True, on="page"),
+        Column("what happened", lambda x: Span(x.broken.note, "muted"), on="page"),
+    ]
+    if all(row.theory is None for row in case.rows):
+        del columns[-3]
+    facts = dict.fromkeys(name for facts in case.facts for name in facts)
+    known = [(name, ", ".join(_number(of.get(name)) for of in case.facts)) for name in facts]
+    why = f"; {case.why}" if case.why else ""
+    swept = ", ".join(filter(None, (case.parameter, case.unit)))
+    error = f"Columns are {swept}. Error: {_MEASURES.get(case.measure, '')}{why}."
+    blocks: list[doc.Block] = [
+        Paragraph(f"{case.about} Held: error ≤ {case.bar:g}."),
+        Table(columns, case.lines, style="map"),
+        Paragraph(error, on="page", note=True),
+        doc.Facts([*_truths(case), *known]),
+    ]
+    return Section(case.name, blocks, on)
+
+
+def _cell(line: Line, k: int) -> Span:
+    if k >= len(line.outcomes):
+        # An interrupted study has fewer cells than values.
+        return Span("", cell="none")
+    cell, how = line.row.cells[k], line.outcomes[k]
+    styles = [shade(cell, how), *(["sil"] if how == "silent" else [])]
+    styles += ["brk"] if k == line.reach and how not in UNKNOWN else []
+    return Span(cell_text(cell, how), cell=" ".join(styles))
+
+
+def _plain(x: float | None, none: str = "") -> str:
+    return none if x is None else f"{x:g}"
+
+
+def _number(x: float | None) -> str:
+    return "–" if x is None or math.isnan(x) else "no limit" if math.isinf(x) else number_text(float(f"{x:.3g}"))
+
+
+def _truths(case: CaseResult) -> Iterator[tuple[str, str]]:
+    """Yield how the truth is known, neighbours of one kind together: for which values, and how."""
+    known = [(number_text(v), *how.partition(_KNOWN)[::2]) for v, how in zip(case.values, case.truths, strict=False)]
+    for how, group in itertools.groupby((x for x in known if x[1]), key=itemgetter(1)):
+        values, _, floors = ([*dict.fromkeys((x[0], x[-1]))] for x in zip(*group, strict=True))
+        yield f"truth at {' … '.join(values)}", how + (_KNOWN + " … ".join(floors) if floors[0] else "")
