@@ -25,7 +25,7 @@ from mbkit.model.elements.references import KINDS_OF_PARTS
 from mbkit.model.validation import listing
 from mbkit.studies._targets import with_values
 from mbkit.studies.explain.study import explain
-from mbkit.studies.explain.terms import Gap, evaluated, gaps, model_terms, states_of
+from mbkit.studies.explain.terms import Gap, evaluated, gaps, model_terms, states_of, worst
 
 FORMATS: Final = ("mjcf", "urdf")
 #: The largest relative error that rounding of rotations and of principal axes makes.
@@ -132,12 +132,13 @@ def _to_mjcf(model: Model) -> Converted:
         own = dynamics(model, DERIVED, compile=False).constraint_residual(at.q)
         if not np.abs(back.constraint_residual(at.q) - own).max() < _TOLERANCE * max(1.0, np.abs(own).max()):
             raise MbkitError(f"convert: loops of {model.name} read back otherwise; please report this model")
-    difference = gaps(model_terms(model, at), values, at.v, model.velocity_joints)
-    if not difference.comparable or difference.worst > _TOLERANCE:
+    difference = gaps(model_terms(model, at), values, at, model)
+    if worst(difference) > _TOLERANCE:
         why = next((n for n in notes if n.startswith("principal moments")), "please report this model")
-        off = f"{difference.worst:.1e} at {difference.joint}"
+        off = ", ".join(f"{g.term} by {g.relative:.1e} at {g.joint}" for g in difference if g.relative > _TOLERANCE)
+        off = off or "in its coordinates"
         raise MbkitError(f"convert: what was written of {model.name} reads back otherwise: {off}; {why}")
-    return Converted(model.name, "mjcf", text, difference.terms, notes)
+    return Converted(model.name, "mjcf", text, difference, notes)
 
 
 def _to_urdf(model: Model) -> Converted:

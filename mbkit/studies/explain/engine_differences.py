@@ -22,12 +22,13 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import KnownDefectWarning, MbkitError, UnsupportedError
 from mbkit.load.shapes import NOTHING, MassProperties
 from mbkit.model import JointCoupling, Model
+from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.kinds import PART_KINDS, that_do
 from mbkit.studies.explain import terms
 from mbkit.studies.explain.merged_model import MergedModel, merge, number_text
 from mbkit.studies.explain.mistakes import Mistake, body_mistakes, joint_mistakes
 from mbkit.studies.explain.result import Cause, Explanation
-from mbkit.studies.explain.terms import TERM, TINY, Gap, Gaps, Values, evaluated, gaps, larger, model_terms
+from mbkit.studies.explain.terms import TERM, TINY, Gaps, Values, evaluated, gaps, larger, model_terms, worst
 
 #: The field that adds to T along a rate.
 _ROTOR: Final = JointCoupling.adding_to("T")[0]
@@ -65,16 +66,16 @@ def engine_causes(a: Model | Dynamics, b: Model | Dynamics, out: Explanation) ->
     before, after = study.before, study.after
     # A term that only some engines have differs for no other cause than a known defect.
     named = {term for c in defects for term in c.effects}
-    left = larger(after.terms, [g for g in study.further_gaps if g.term not in named])
+    left = larger(after, tuple(g for g in study.further_gaps if g.term not in named))
     explained = max((g.relative for g in left), default=np.inf) <= out.tolerance
     return replace(
         out,
-        agree=out.agree and max(before.worst, *(g.relative for g in study.further_gaps), 0.0) <= out.tolerance,
-        gaps=larger(out.gaps, (*before.terms, *study.further_gaps)),
+        agree=out.agree and max(worst(before), *(g.relative for g in study.further_gaps), 0.0) <= out.tolerance,
+        gaps=larger(out.gaps, (*before, *study.further_gaps)),
         causes=(*out.causes, *defects, *causes),
         explained=out.explained and explained,
         left=larger(out.left, left),
-        subtree=out.subtree or (study.subtree() if not after.worst <= out.tolerance else ()),
+        subtree=out.subtree or (study.subtree() if not worst(after) <= out.tolerance else ()),
     )
 
 
@@ -110,10 +111,10 @@ class _Engines:
                 )
         self.target = self.values[b]
         self.before = self.after = self._gaps(self.values[a])
-        self.further_gaps: list[Gap] = []
+        self.further_gaps: Gaps = ()
         # Pinocchio is fast: it answers for the first engine where both say the same.
-        described = gaps(self.values[a], model_terms(self.model, self.at), self.at.v, self.joints)
-        self.pinocchio_agrees = described.worst <= self.tolerance
+        described = gaps(self.values[a], model_terms(self.model, self.at), self.at, self.model)
+        self.pinocchio_agrees = worst(described) <= self.tolerance
 
     def _terms(self, model: Model, **states: Any) -> Values:
         """Return the first engine's terms of another description or at other states; none where it refuses."""
@@ -124,17 +125,17 @@ class _Engines:
             return {}
 
     def _gaps(self, values: Values) -> Gaps:
-        return gaps(values, self.target, self.at.v, self.joints)
+        return gaps(values, self.target, self.at, self.model)
 
     def defects(self) -> list[Cause]:
         """Return the known defects that show: the engine's other computation of the value is right."""
         out, sides = [], [(dyn, *self._further_terms(dyn)) for dyn in (self.a, self.b)]
-        found = gaps(sides[0][1], sides[1][1], self.at.v, self.joints).terms
-        self.further_gaps = [gap for gap in found if gap.term != "M"]
+        found = gaps(sides[0][1], sides[1][1], self.at, self.model)
+        self.further_gaps = tuple(gap for gap in found if gap.term != "M")
         for gap in (x for x in self.further_gaps if x.relative > self.tolerance):
             for (dyn, _, known), (_, other, _) in (sides, sides[::-1]):
                 right = {"M": self.values[dyn]["M"]} | self._from_other_terms(dyn, gap.term)
-                same = [x for x in gaps(right, other, self.at.v, self.joints).terms if x.term == gap.term]
+                same = [x for x in gaps(right, other, self.at, self.model) if x.term == gap.term]
                 if gap.term in known and same and same[0].relative <= self.tolerance:
                     says = f"{gap.term}: {known[gap.term].split('; returned as it is')[0]}"
                     effects = {gap.term: gap.relative}
@@ -160,14 +161,14 @@ class _Engines:
 
     def causes(self) -> list[Cause]:
         """Return the first mistake after which the first engine answers as the second does."""
-        if self.before.worst <= self.tolerance:
+        if worst(self.before) <= self.tolerance:
             return []
         for x in chain(self._conventions(), self._linear(), self._parts()):
             left = self._gaps(x.values)
-            if left.worst <= self.tolerance:
+            if worst(left) <= self.tolerance:
                 self.after = left
                 says = f"{x.subject}{': ' * bool(x.subject)}{self.name} {x.says}"
-                effects = {g.term: g.relative for g in self.before.terms}
+                effects = {g.term: g.relative for g in self.before}
                 return [Cause(x.kind, x.subject, says, None, None, effects, acts=True)]
         return []
 
@@ -364,12 +365,12 @@ class _Engines:
         whole = merge(self.model).model
 
         def differs(names: set[str]) -> bool:
-            some = terms.part(whole, names)
+            some = terms.restricted(whole, names).without(*CONSTRAINT_FEATURES)
             at = terms.states_of(some, len(self.at.q), 0)
             try:
                 one, other = (evaluated(type(x)(some), at) for x in (self.a, self.b))
             except MbkitError:
                 return False
-            return gaps(one, other, at.v, some.velocity_joints).worst > self.tolerance
+            return worst(gaps(one, other, at, some)) > self.tolerance
 
         return terms.minimal_differing_subtree(whole, differs)

@@ -13,6 +13,7 @@ from mbkit._check import count, real
 from mbkit.engines import Dynamics
 from mbkit.errors import InputError, MbkitWarning
 from mbkit.model import GravityCompensation, Model
+from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import Path
 from mbkit.model.model import unchecked
@@ -28,7 +29,7 @@ from mbkit.studies.explain.hypotheses import (
 from mbkit.studies.explain.joint_matching import Match, Matching, align_frames, reconcile_joint_sets, rename_joints
 from mbkit.studies.explain.merged_model import MergedModel, Tolerances, merge, number_text, with_common_frames
 from mbkit.studies.explain.result import Cause, Explanation
-from mbkit.studies.explain.terms import WHOLE, Gaps, model_terms, states_of
+from mbkit.studies.explain.terms import WHOLE, Gap, Gaps, effects, larger, model_terms, states_of, worst
 from mbkit.studies.results import to_plain
 
 #: Parts of any kind are compared by their fields.
@@ -88,11 +89,8 @@ def explain(
     # Mistakes that are tried on a description may leave one that cannot be.
     with unchecked():
         one, other = (replace(x, time=_moment(model_a, model_b)) for x in (model_a, model_b))
-        sides = _Descriptions(one, other, names or _names(a, b), samples, seed, tolerance)
-        out = sides.with_weights_held(sides.explain(), model_a, model_b)
-        if not isinstance(a, Dynamics) and not isinstance(b, Dynamics):
-            return out
-        return engine_causes(a, b, out)
+        out = _Descriptions(one, other, names or _names(a, b), samples, seed, tolerance).explain()
+        return engine_causes(a, b, out) if isinstance(a, Dynamics) or isinstance(b, Dynamics) else out
 
 
 def _model(x: Model | Dynamics, which: str) -> Model:
@@ -136,15 +134,14 @@ class _Descriptions:
         one, other, matching, structural = reconcile_joint_sets(self.a, self.b, near)
         theirs = rename_joints(other, one.model, matching)
         target, moved_frames = align_frames(theirs, one.model, near)
-        if moved_frames and self._gaps(theirs.model, target.model).worst > self.tolerance:
-            target, moved_frames = theirs, ()
         before = by_name or self._gaps(one.model, theirs.model)
-        whole = self._acceleration_gap(one.model, theirs.model) if before.worst <= self.tolerance else 0.0
+        whole = self._whole(one.model, theirs.model) if (alike := worst(before) <= self.tolerance) else ()
         one, target = with_common_frames(*links_in_common_axes(one, target, near))
         changed, hypotheses = one, summarized_differences(one, target, near) if one.model.nv else []
         for h in hypotheses:
             changed = h.apply(changed)
         after = self._gaps(changed.model, target.model)
+        held = [*self._weights_held(near)]
         causes = (
             *(self._cause(h, {"M": np.inf}) for h in structural),
             *self._naming_causes(one, other, matching, by_name),
@@ -155,110 +152,103 @@ class _Descriptions:
                 for h in ground_differences(*links_in_common_axes(*wholes, near), near, self.names[0])
                 if not near.same(one.ground, target.ground)
             ),
+            *(self._cause(h, effects(found)) for h, found in held),
         )
         acting = [c.kind for c in causes if c.acts]
         massless = bool(one.model.nv) and self._is_massless(one.model) and self._is_massless(target.model)
-        alike = before.worst <= self.tolerance and not whole > self.tolerance
-        agree = alike and not (structural or massless or CONSTRAINTS.intersection(acting))
-        explained = after.worst <= self.tolerance and (agree or massless or bool(acting))
+        found = larger(before, self._large(whole), *(more for _, more in held)) if before else ()
+        agree = worst(found) <= self.tolerance and not (structural or massless or CONSTRAINTS.intersection(acting))
+        explained = worst(after) <= self.tolerance and (agree or massless or bool(acting))
         if explained and not agree and not massless:
-            left = self._acceleration_gap(changed.model, target.model)
-            explained, after = not left > self.tolerance, after.with_whole(left)
-        found = before.with_whole(whole if whole > self.tolerance else np.nan)
+            left = self._whole(changed.model, target.model)
+            explained, after = not self._large(left), (*after, *left)
 
         def differs(joints: set[str]) -> bool:
-            return self._gaps(*(terms.part(x.model, joints) for x in (changed, target))).worst > self.tolerance
+            some = (terms.restricted(x.model, joints).without(*CONSTRAINT_FEATURES) for x in (changed, target))
+            return worst(self._gaps(*some)) > self.tolerance
 
         return Explanation(
             a=self.names[0],
             b=self.names[1],
             agree=agree,
-            gaps=found.terms,
-            comparable=before.comparable and not structural,
+            gaps=found,
+            comparable=bool(before) and not structural,
             matches=matching.pairs,
             only_a=matching.only_a,
             only_b=matching.only_b,
             causes=causes,
             notes=(*_notes(one, moved_frames, matching), *_named_frames(self.a, self.b, near)),
             explained=explained,
-            left=after.terms,
+            left=after,
             subtree=() if explained else terms.minimal_differing_subtree(changed.model, differs),
             samples=self.samples,
             seed=self.seed,
             tolerance=self.tolerance,
             massless=massless,
-            compared=massless or not np.isnan(whole),
+            compared=massless or bool(whole) or not alike,
         )
 
-    def with_weights_held(self, out: Explanation, a: Model, b: Model) -> Explanation:
-        """Return the explanation with what differs in the weights that the two whole descriptions hold, body by body.
-
-        `explain` merges bodies, and such a force acts on each of them.
-        """
-        ours, theirs = ({f.body: f for f in x.forces if isinstance(f, GravityCompensation)} for x in (a, b))
-        near, causes, found = Tolerances.of(a, self.tolerance), list[Cause](), out.gaps
+    def _weights_held(self, near: Tolerances) -> Iterator[tuple[Hypothesis, Gaps]]:
+        """Yield differences in the weights that the whole descriptions hold, body by body: `merge` joins bodies."""
+        ours, theirs = ({f.body: f for f in x.forces if isinstance(f, GravityCompensation)} for x in (self.a, self.b))
         for body in dict.fromkeys([*ours, *theirs]):
             one, other = (side.get(body) or GravityCompensation(body, 0.0) for side in (ours, theirs))
-            if not (changed := near.differing(one, other)):
-                continue
-            model = a if body in ours else b
-            known = {j.name for j in model.joints}
-            held = (replace(x, without=tuple(j for j in x.without if j in known)) for x in (one, other))
-            gaps = self._gaps(*(replace(model, forces=(x,)) for x in held))
-            says = f"holds {number_text(other.fraction)} of its weight for {number_text(one.fraction)}"
-            says = says if "fraction" in changed else "holds its weight at other joints"
-            h = Hypothesis("gravity compensation", f"body {body!r}", says, a=one.fraction, b=other.fraction)
-            causes.append(self._cause(h, gaps.effects))
-            found = terms.larger(found, gaps.terms) if out.comparable else found
-        acts = any(c.acts for c in causes)
-        return replace(out, agree=out.agree and not acts, causes=(*out.causes, *causes), gaps=found)
+            if changed := near.differing(one, other):
+                model = self.a if body in ours else self.b
+                known = {j.name for j in model.joints}
+                held = (replace(x, without=tuple(j for j in x.without if j in known)) for x in (one, other))
+                says = f"holds {number_text(other.fraction)} of its weight for {number_text(one.fraction)}"
+                says = says if "fraction" in changed else "holds its weight at other joints"
+                h = Hypothesis("gravity compensation", f"body {body!r}", says, a=one.fraction, b=other.fraction)
+                yield h, self._gaps(*(replace(model, forces=(x,)) for x in held))
 
     def _is_massless(self, model: Model) -> bool:
         M = model_terms(model, states_of(model, self.samples, self.seed)).get("M")
         return M is not None and not M.any()
 
+    def _large(self, gaps: Gaps) -> Gaps:
+        return tuple(g for g in gaps if not g.relative <= self.tolerance)
+
     def _gaps(self, a: Model, b: Model) -> Gaps:
         if a.velocity_names != b.velocity_names or not a.nv:
-            return Gaps(comparable=False)
+            return ()
         at = states_of(b, self.samples, self.seed)
-        out = terms.gaps(model_terms(a, at), model_terms(b, at), at.v, a.velocity_joints)
-        return replace(out, terms=(*out.terms, *terms.jump_gap(a, b, a.velocity_joints)))
+        out = terms.gaps(model_terms(a, at), model_terms(b, at), at, a)
+        return (*out, *terms.jump_gap(a, b)) if out else ()
 
-    def _gaps_by_name(self, one: MergedModel, other: MergedModel) -> Gaps | None:
+    def _gaps_by_name(self, one: MergedModel, other: MergedModel) -> Gaps:
         """Return the differences of terms with joints matched by name, where the names are the same."""
         ours, theirs = ([j.name for j in x.model.joints] for x in (one, other))
         if sorted(ours) != sorted(theirs):
-            return None
+            return ()
         pairs = tuple(Match(n, n, "name") for n in ours)
         return self._gaps(one.model, rename_joints(other, one.model, Matching(pairs, (), ())).model)
 
-    def _acceleration_gap(self, a: Model, b: Model) -> float:
-        """Return the difference between the accelerations of two whole systems; NaN where nothing can be compared."""
+    def _whole(self, a: Model, b: Model) -> Gaps:
+        """Return the difference between the accelerations of two whole systems; none where nothing can be compared."""
         if a.velocity_names != b.velocity_names or not a.nv:
-            return np.nan
+            return ()
         # A state of one may be off the other's constraints, which is what is asked.
         with warnings.catch_warnings(action="ignore", category=MbkitWarning):
-            return terms.whole_gap(a, b, self.samples, self.seed)
+            apart = terms.whole_gap(a, b, self.samples, self.seed)
+        return () if np.isnan(apart) else (Gap(WHOLE, apart, ""),)
 
-    def _cause(self, h: Hypothesis, effects: dict[str, float]) -> Cause:
-        acts = any(not x <= self.tolerance for x in effects.values())
+    def _cause(self, h: Hypothesis, by_term: dict[str, float]) -> Cause:
+        acts = any(not x <= self.tolerance for x in by_term.values())
         head = f"{h.subject}: " if h.subject else ""
-        return Cause(h.kind, h.subject, f"{head}{self.names[1]} {h.says}", to_plain(h.a), to_plain(h.b), effects, acts)
+        return Cause(h.kind, h.subject, f"{head}{self.names[1]} {h.says}", to_plain(h.a), to_plain(h.b), by_term, acts)
 
     def _measured_cause(self, h: Hypothesis, one: MergedModel, target: MergedModel) -> Cause:
         """Return a difference with the larger of its two effects, added alone to one side or removed from the other."""
-        effects: dict[str, float] = {}
-        for model, changed in ((one, h.apply(one)), (target, h.revert(target))) if h.changes else ():
-            if h.kind in CONSTRAINTS:
-                apart = self._acceleration_gap(model.model, changed.model)
-                found = {WHOLE: np.inf if np.isnan(apart) else apart}
-            else:
-                found = self._gaps(model.model, changed.model).effects
-            effects |= {term: max(x, effects.get(term, 0.0)) for term, x in found.items()}
-        return self._cause(h, effects)
+        sides = ((one, h.apply(one)), (target, h.revert(target))) if h.changes else ()
+        if h.kind in CONSTRAINTS:
+            found = [self._whole(x.model, y.model) or (Gap(WHOLE, np.inf, ""),) for x, y in sides]
+        else:
+            found = [self._gaps(x.model, y.model) or (Gap("M", np.inf, ""),) for x, y in sides]
+        return self._cause(h, {g.term: g.relative for g in larger(*found)})
 
     def _naming_causes(
-        self, one: MergedModel, other: MergedModel, matching: Matching, by_name: Gaps | None
+        self, one: MergedModel, other: MergedModel, matching: Matching, by_name: Gaps
     ) -> Iterator[Cause]:
         """Yield differences in the names of joints and in their order in q."""
         ours = {j.name for j in one.model.joints}
@@ -268,7 +258,7 @@ class _Descriptions:
         )
         if exchanged:
             h = Hypothesis("names exchanged", "", f"calls joints by each other's names: {exchanged}")
-            yield self._cause(h, by_name.effects if by_name else {"M": np.inf})
+            yield self._cause(h, effects(by_name))
         if others:
             yield self._cause(Hypothesis("renamed", "", f"calls joints otherwise: {others}"), {})
         there = [j.name for j in other.model.independent_joints if j.name in matching.to_b.values()]

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any, Final
 
 import numpy as np
@@ -58,37 +59,24 @@ class Gap:
     joint: str
 
 
-@dataclass(frozen=True)
-class Gaps:
-    """The largest difference of each term; `comparable` is False where the coordinates differ."""
-
-    terms: tuple[Gap, ...] = ()
-    comparable: bool = True
-
-    @property
-    def worst(self) -> float:
-        """The largest of all; infinite where nothing can be compared."""
-        return max((g.relative for g in self.terms), default=0.0) if self.comparable else np.inf
-
-    @property
-    def joint(self) -> str:
-        """The joint of the largest."""
-        return max(self.terms, key=lambda g: g.relative).joint if self.terms else ""
-
-    @property
-    def effects(self) -> dict[str, float]:
-        """Term -> difference; an infinite one of M where nothing can be compared."""
-        return {g.term: g.relative for g in self.terms} if self.comparable else {"M": np.inf}
-
-    def with_whole(self, relative: float) -> Gaps:
-        """Return them with the difference of the whole systems, unless it is not known."""
-        return self if np.isnan(relative) else replace(self, terms=(*self.terms, Gap(WHOLE, relative, "")))
+#: The gap of each term; empty where nothing can be compared, as the coordinates differ.
+Gaps = tuple[Gap, ...]
 
 
-def larger(one: Iterable[Gap], other: Iterable[Gap]) -> tuple[Gap, ...]:
-    """Return every term once, with the larger of two gaps."""
+def worst(gaps: Gaps) -> float:
+    """Return the largest of all; infinite where nothing can be compared."""
+    return max((g.relative for g in gaps), default=np.inf)
+
+
+def effects(gaps: Gaps) -> dict[str, float]:
+    """Return term -> difference; an infinite one of M where nothing can be compared."""
+    return {g.term: g.relative for g in gaps} or {"M": np.inf}
+
+
+def larger(*several: Gaps) -> Gaps:
+    """Return every term once, with the largest of its gaps."""
     out: dict[str, Gap] = {}
-    for gap in (*one, *other):
+    for gap in chain(*several):
         out[gap.term] = max(out.get(gap.term, gap), gap, key=lambda x: x.relative)
     return tuple(out.values())
 
@@ -127,39 +115,39 @@ def evaluated(dyn: Dynamics, at: States) -> Values:
     return out
 
 
-def gaps(a: Values, b: Values, v: Array, joints: Sequence[str]) -> Gaps:
-    """Return the differences of values at states with velocities v of these joints, scaled by those of `a`."""
+def gaps(a: Values, b: Values, at: States, model: Model) -> Gaps:
+    """Return the differences of values at states of a model, scaled by those of `a`."""
     # An engine may refuse the state, or have another number of velocities.
     if "M" not in a or "M" not in b or a["M"].shape != b["M"].shape:
-        return Gaps(comparable=False)
-    M = a["M"]
+        return ()
+    M, v = a["M"], at.v
     diagonal, nothing = np.einsum("nii->ni", M).copy(), np.zeros(len(M))
     inertial = np.linalg.norm(M, axis=(1, 2)) * np.sum(v * v, axis=1)
     scales = Scales(M, diagonal, inertial, nothing, np.zeros_like(diagonal), nothing, nothing)
     out = []
-    for term in [t for t in a if t in b]:
+    for term in (t for t in a if t in b):
         measured = TERM[term].errors(b[term] - a[term], a[term], scales)
         per = measured.per_velocity
-        joint = joints[int(np.argmax(per))] if per.size and per.max() > 0 else ""
+        joint = model.velocity_joints[int(np.argmax(per))] if per.size and per.max() > 0 else ""
         largest = float(measured.relative.max(initial=0.0))
         # A NaN would be lost in a maximum.
         out.append(Gap(term, np.inf if np.isnan(largest) else largest, joint))
-    return Gaps(tuple(out))
+    return tuple(out)
 
 
-def jump_gap(a: Model, b: Model, joints: Sequence[str]) -> Iterator[Gap]:
-    """Yield the difference of forces that jump at rest and about the Stribeck velocities, which random states miss.
+def jump_gap(a: Model, b: Model) -> Gaps:
+    """Return the difference of forces that jump at rest and about the Stribeck velocities, which random states miss.
 
     Each velocity's is relative to its own.
     """
     numbers = [FrictionNumbers.of(x.joints) for x in (a, b)]
     if all((x.bound == x.sliding).all() for x in numbers):
-        return
+        return ()
     speeds = np.unique(np.concatenate([x.stribeck for x in numbers]))[:, None] * np.ones(a.nv)
     ours, theirs = (np.vstack([law.bound, -law.force_at(speeds)]) for law in map(DryFrictionLaw, (a, b)))
     size = np.maximum(ours, theirs).max(axis=0)
     apart = np.abs(ours - theirs).max(axis=0) / np.where(size > 0, size, 1.0)
-    yield Gap(EFFECTS["jump"], float(apart.max()), joints[int(np.argmax(apart))])
+    return (Gap(EFFECTS["jump"], float(apart.max()), a.velocity_joints[int(np.argmax(apart))]),)
 
 
 def whole_gap(a: Model, b: Model, samples: int, seed: int) -> float:
@@ -210,12 +198,16 @@ def _consistent(dyn: Dynamics, q: Array, v: Array) -> bool:
 
 
 def restricted(model: Model, joints: Collection[str]) -> Model:
-    """Return the description with some joints alone and the bodies on them; mimic joints follow only these."""
+    """Return the description with some joints alone and the bodies on them; mimic joints follow only these.
+
+    A joint whose parent is left out is fixed in the world as it is on its parent.
+    """
     kept = [j for j in model.joints if j.name in joints]
+    kept = [j if j.mimic is None or j.mimic.joint in joints else replace(j, mimic=None) for j in kept]
     bodies = {j.child for j in kept}
     return fitting(
         model,
-        joints=tuple(j if j.mimic is None or j.mimic.joint in joints else replace(j, mimic=None) for j in kept),
+        joints=tuple(j if j.parent in bodies else replace(j, parent="world") for j in kept),
         bodies=tuple(b for b in model.bodies if b.name in bodies),
         nonphysical=tuple(x for x in model.nonphysical if x[0] in bodies),
     )
@@ -243,20 +235,6 @@ def fitting(model: Model, **fields: Any) -> Model:
         replace(c, joints=tuple(c.joints[k] for k in some), factors=c.factors[some]) for c, some in kept if some
     )
     return replace(tree, **parts)
-
-
-def part(model: Model, joints: Collection[str]) -> Model:
-    """Return some joints of a merged description with their bodies, without constraints.
-
-    A joint whose parent is left out is fixed in the world as it is on its parent.
-    """
-    out = restricted(model, joints).without(*CONSTRAINT_FEATURES)
-    bodies = {b.name for b in out.bodies}
-    return replace(
-        out,
-        joints=tuple(j if j.parent in bodies else replace(j, parent="world") for j in out.joints),
-        couplings=tuple(c for c in model.couplings if set(c.joints) <= set(joints)),
-    )
 
 
 def minimal_differing_subtree(model: Model, differs: Callable[[set[str]], bool]) -> tuple[str, ...]:

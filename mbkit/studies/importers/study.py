@@ -8,7 +8,6 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from operator import itemgetter
@@ -19,6 +18,7 @@ import numpy as np
 
 from mbkit._check import Array, count, real
 from mbkit._child_process import WorkerDiedError, WorkerTimeoutError
+from mbkit._fork import fork_safe
 from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.imported import IMPORTERS, Imported, Importer, check_installed, reader
 from mbkit.engines.remote import importer as remote_importer
@@ -39,7 +39,7 @@ from mbkit.studies.compare.terms import States
 from mbkit.studies.explain.merged_model import Tolerances
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
-from mbkit.studies.explain.terms import TERMS, Gap, Gaps, Values, gaps, model_terms, states_of
+from mbkit.studies.explain.terms import TERMS, Gap, Gaps, Values, effects, gaps, model_terms, states_of, worst
 from mbkit.studies.importers.loops import Written, activated, between_joints, coupler_differences, loop_differences
 from mbkit.studies.importers.result import FILE, MISSING, Parsed, ParserComparison, Stage
 from mbkit.studies.study_runs import free_of_mimic
@@ -55,18 +55,9 @@ _OWN_TERMS: Final = "own terms"
 
 _workers: Final[dict[Importer, Worker]] = {}
 #: Held by a comparison: each importer's process holds one file.
-_lock = threading.Lock()
+_lock: Final = fork_safe(threading.RLock())
 #: In a worker process: the file that it holds.
 _held: Imported | None = None
-
-
-def _renew_lock() -> None:
-    global _lock
-    _lock = threading.Lock()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_renew_lock)
 
 
 class ImporterError(Exception):
@@ -86,21 +77,45 @@ def _asked(engine: str, function: Callable[..., Any], *args: Any) -> Any:
         raise ImporterError(describe(error).removeprefix(f"{engine}: ")) from None
 
 
-def _reading(engine: str, version: EngineVersion | None, file: tuple[Any, ...], seconds: float) -> Imported:
-    """Return an importer's reading of a file, or that of a version in an environment of its own, with its own time.
+def _readings(
+    stripped: Stripped,
+    engines: Sequence[str],
+    elsewhere: Mapping[str, EngineVersion],
+    floating_base: bool,
+    seconds: float,
+) -> tuple[dict[str, Imported], dict[str, str]]:
+    """Return each importer's reading of a file, and why the others refuse it; all read at the same time.
 
-    It takes at most `seconds` of processor time, and so does each call of its terms. Raises `UnsupportedError` where
-    the importer is not installed, and `ImporterError`.
+    Each takes at most `seconds` of processor time, and so does each call of its terms; a version in an environment of
+    its own has a time of its own.
     """
-    if version:
-        ask, begin = partial(_asked, engine), partial(remote_importer.read, version)
-    else:
-        check_installed(engine)
-        importer = IMPORTERS[engine]
-        call = partial(_workers.setdefault(importer, Worker()).call, cpu_seconds=seconds)
-        ask, begin = partial(_asked, engine, call), partial(_read, importer.module)
-    read: Imported = ask(begin, *file)
-    return replace(read, terms=partial(ask, read.terms))
+    file = (stripped.text, stripped.format, floating_base, stripped.meshes)
+    read, refused, reading = dict[str, Imported](), dict[str, str](), dict[str, Worker]()
+    try:
+        for engine in (x for x in engines if x not in elsewhere):
+            try:
+                check_installed(engine)
+                reading[engine] = _workers.setdefault(IMPORTERS[engine], Worker())
+                reading[engine].begin(_read, IMPORTERS[engine].module, *file)
+            except UnsupportedError as error:
+                refused[engine] = str(error)
+        for engine in (x for x in engines if x not in refused):
+            ask = partial(_asked, engine)
+            try:
+                if engine in elsewhere:
+                    found: Imported = ask(remote_importer.read, elsewhere[engine], *file)
+                else:
+                    found = ask(reading[engine].finish, seconds)
+                    ask = partial(ask, partial(reading[engine].call, cpu_seconds=seconds))
+                read[engine] = replace(found, terms=partial(ask, found.terms))
+            except ImporterError as error:
+                refused[engine] = str(error)
+    finally:
+        # Nobody waits any more for those that still read where this is interrupted.
+        for engine, worker in reading.items():
+            if engine not in read and engine not in refused:
+                worker.end()
+    return read, refused
 
 
 def _read(module: str, *file: Any) -> Imported:
@@ -137,13 +152,16 @@ def compared(engine: str, imported: Imported, file: Model, loops: Written, asked
     if own and same and not (why.only_a or why.only_b):
         silent = tuple(c for c in why.causes if not c.acts)
         why = replace(why, agree=True, gaps=found, causes=silent, explained=True, left=(), subtree=())
-    elif own:
-        # The engine computes other terms than those of its bodies and joints.
-        explained = why.explained and all(c.kind != _OWN_TERMS for c in own)
-        why = replace(why, agree=False, comparable=why.comparable and known, causes=(*why.causes, *own))
-        why = replace(why, gaps=found if known else why.gaps, explained=explained)
     else:
-        why = replace(why, agree=why.agree and same, gaps=found if why.agree and same else why.gaps)
+        why = replace(
+            why,
+            agree=(agree := why.agree and same and not own),
+            comparable=why.comparable and (known or not own),
+            gaps=found if known and (own or agree) else why.gaps,
+            causes=(*why.causes, *own),
+            # The engine may compute other terms than those of its bodies and joints.
+            explained=why.explained and all(c.kind != _OWN_TERMS for c in own),
+        )
     if way := imported.holds_mimics:
         # Their constraints are outside of all terms.
         free, tied = "leaves it free, which", f"holds it {way}, outside its terms; it"
@@ -170,19 +188,19 @@ def stages(
         _constraints("loops", names, () if names else loop_differences(loops, read, near)),
         _constraints("couplers", loops.faults, coupler_differences(loops, file, read, tolerance)),
     ]
-    apart = Gaps(comparable=False)
+    apart: Gaps = ()
     if not lost:
         at = states_of(free, samples, seed)
         own = model_terms(free.smooth, at)
         own["passive"] = own["passive"] + DryFrictionLaw(free).force(at.v)
-        apart = gaps(own, _own_terms_of(free, imported, there, at), at.v, free.velocity_joints)
-    by_term = {g.term: g for g in apart.terms}
+        apart = gaps(own, _own_terms_of(free, imported, there, at), at, free)
+    by_term = {g.term: g for g in apart}
     for name in TERMS:
         if g := by_term.get(name):
             says = f"{g.relative:.1e} at {g.joint}"
             out.append(Stage(name, g.relative <= tolerance, g.relative, g.joint, says))
         else:
-            out.append(Stage(name, None, math.nan, "", "not computed" if apart.comparable else "other coordinates"))
+            out.append(Stage(name, None, math.nan, "", "not computed" if apart else "other coordinates"))
     return tuple(out)
 
 
@@ -221,7 +239,6 @@ def own_terms(
 ) -> tuple[list[Cause], list[str]]:
     """Return what acts in an importer's model beside bodies and joints, and what does not."""
     at = states_of(imported.model, samples, seed)
-    joints = imported.model.velocity_joints
     whole, described = _terms(imported, at), model_terms(imported.model, at)
     bare = _terms(imported, at, tuple(x.key for x in imported.beside)) if imported.beside else whole
     causes, idle = [], []
@@ -230,17 +247,18 @@ def own_terms(
         rest = {} if extra.without is None else model_terms(extra.without, at)
         part = {name: x - rest[name] for name, x in described.items() if name in rest}
         bare = _with(bare, part)
-        if gaps(whole, without, at.v, joints).worst <= tolerance:
+        if worst(gaps(whole, without, at, imported.model)) <= tolerance:
             idle.append(f"{extra.says}; in no term while controls are zero")
             continue
-        apart = gaps(whole, _with(without, part), at.v, joints)
-        if not apart.worst <= tolerance:
+        apart = gaps(whole, _with(without, part), at, imported.model)
+        if not worst(apart) <= tolerance:
             says = f"{engine}: {extra.says}{', and acts otherwise than described' if part else ''}"
-            causes.append(Cause(extra.kind, extra.says, says, None, None, apart.effects, acts=True))
-    apart = gaps(bare, described, at.v, joints)
-    if not apart.worst <= tolerance:
-        says = f"{engine}: its own terms are not those of its bodies and joints, most at {apart.joint or 'no joint'}"
-        causes.append(Cause(_OWN_TERMS, engine, says, None, None, apart.effects, acts=True))
+            causes.append(Cause(extra.kind, extra.says, says, None, None, effects(apart), acts=True))
+    apart = gaps(bare, described, at, imported.model)
+    if not worst(apart) <= tolerance:
+        joint = max(apart, key=lambda g: g.relative).joint if apart else ""
+        says = f"{engine}: its own terms are not those of its bodies and joints, most at {joint or 'no joint'}"
+        causes.append(Cause(_OWN_TERMS, engine, says, None, None, effects(apart), acts=True))
     return causes, idle
 
 
@@ -338,35 +356,6 @@ def compare_parsers(
         **asked,
         **results.provenance(begun),
     )
-
-
-def _readings(
-    stripped: Stripped,
-    engines: Sequence[str],
-    elsewhere: Mapping[str, EngineVersion],
-    floating_base: bool,
-    seconds: float,
-) -> tuple[dict[str, Imported], dict[str, str]]:
-    """Return each importer's reading of a file, and why the others refuse it; all read at the same time."""
-    file = (stripped.text, stripped.format, floating_base, stripped.meshes)
-    read: dict[str, Imported] = {}
-    refused: dict[str, str] = {}
-    with ThreadPoolExecutor(len(engines)) as pool:
-        begun = {x: pool.submit(_reading, x, None, file, seconds) for x in engines if x not in elsewhere}
-        try:
-            for engine in engines:
-                try:
-                    other = elsewhere.get(engine)
-                    read[engine] = _reading(engine, other, file, seconds) if other else begun[engine].result()
-                except (UnsupportedError, ImporterError) as error:
-                    refused[engine] = str(error)
-        except BaseException:
-            # Nobody waits any more for those that still read.
-            for engine in begun:
-                if worker := _workers.pop(IMPORTERS[engine], None):
-                    worker.close()
-            raise
-    return read, refused
 
 
 def written(source: str | os.PathLike[str]) -> Model:
