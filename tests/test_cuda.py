@@ -473,5 +473,6 @@ def test_ptx_is_assembled_for_real_gpus(target: str) -> None:
     found = study.assemble(forward, target, ptxas)
     assert found["registers"] <= 255
     assert found["spilled"] == 0
-    steps = steps_code(march_in_stages(dyn.equations, "rk4", fed=True), STATE)[0]
+    full = mb.simulate.StateFeedback(np.ones((model.nv, model.nq + model.nv))).pattern
+    steps = steps_code(march_in_stages(dyn.equations, "rk4", fed=full), STATE)[0]
     assert study.assemble(steps, target, ptxas)["registers"] <= 255

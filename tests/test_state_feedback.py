@@ -16,8 +16,9 @@ from tests.random_trees import off, random_tree, states
 
 def law(model: mb.Model, seed: int = 0) -> StateFeedback:
     rng = np.random.default_rng(seed)
+    shape = model.nv, model.nq + model.nv
     return StateFeedback(
-        rng.normal(size=(model.nv, model.nq + model.nv)),
+        rng.normal(size=shape) * (rng.random(shape) < 0.7),
         q=rng.normal(size=model.nq),
         v=rng.normal(size=model.nv),
         torque=rng.normal(size=model.nv),
@@ -82,8 +83,20 @@ def test_the_law_is_what_it_says() -> None:
     feedback = StateFeedback(given, q0, v0, u0)
     given[:] = 0.0
     assert feedback(0.0, q, v) == pytest.approx(u0 + K @ np.concatenate([q0 - q, v0 - v]), rel=1e-14)
-    assert feedback.numbers.reshape(2, 5)[:, 1:].tolist() == K.tolist()
+    assert feedback.numbers[2:].tolist() == K.ravel().tolist()
     assert repr(feedback) == "<StateFeedback of 4 numbers to 2 torques>"
+
+
+def test_zeros_of_a_gain_are_not_in_the_compiled_step() -> None:
+    model = random_tree(1, 4, ("revolute", "prismatic"))
+    dyn = mb.dynamics(model, "lagrangian", compile=True)
+    gains = np.hstack([np.eye(4), np.eye(4)])
+    with_gains, alone = (
+        sum(code.operations for code in dyn._step_plan("rk4", fed=fed).codes)
+        for fed in (StateFeedback(gains).pattern, "")
+    )
+    # Four stages: a product and a sum for each gain, and two sums for each torque; a full gain has 32 entries.
+    assert with_gains - alone <= 4 * (8 + 2 * 4)
 
 
 def test_a_diverging_run_says_so() -> None:

@@ -95,7 +95,7 @@ class Plan:
     """An explicit method's step for one model in machine code: its parts in order, and the rows of what they use.
 
     `code` compiles a part. `thorough`: of a step that the quick projection onto constraints loses;
-    `fed`: under a state feedback; `behind`: parts that follow it.
+    `fed`: under a state feedback with a gain of this pattern; `behind`: parts that follow it.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class Plan:
         code: Callable[[Part], Compiled],
         *,
         thorough: bool = False,
-        fed: bool = False,
+        fed: str = "",
         behind: Sequence[Part] = (),
     ) -> None:
         step = parts_of(equations, method, lambda x: code(x).operations, thorough=thorough, fed=fed)

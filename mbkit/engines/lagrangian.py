@@ -472,13 +472,11 @@ class LagrangianDynamics(Dynamics):
             return False
         return not isinstance(self._code("forward_dynamics"), Machine)
 
-    def _step_plan(
-        self, method: str, *, thorough: bool = False, fed: bool = False, behind: Sequence[Part] = ()
-    ) -> Plan:
+    def _step_plan(self, method: str, *, thorough: bool = False, fed: str = "", behind: Sequence[Part] = ()) -> Plan:
         """Return the compiled parts of an explicit method's step; `_compiles_steps` says whether there are some.
 
         `thorough`: with the projection for steps that the usual one loses to their constraints; `fed`: under a state
-        feedback; `behind`: with these parts at its end.
+        feedback with a gain of this pattern; `behind`: with these parts at its end.
         """
         from mbkit.engines.compiled_calls import Plan
 
@@ -498,7 +496,7 @@ class LagrangianDynamics(Dynamics):
             steps[key] = CompiledStep(self.model, self.equations, self._step_plan(method, behind=[part]), self._part)
         return steps[key]
 
-    def _device_steps(self, method: str, *, thorough: bool = False, fed: bool = False) -> CudaSteps:
+    def _device_steps(self, method: str, *, thorough: bool = False, fed: str = "") -> CudaSteps:
         """Return the same steps on the GPU of these dynamics."""
         from mbkit.codegen.cuda.driver import device_of
         from mbkit.codegen.cuda.runs import MAX_STEP_OPERATIONS, steps_on_device
@@ -506,7 +504,7 @@ class LagrangianDynamics(Dynamics):
 
         assert self.device is not None
         held: dict[Any, CudaSteps] = self.equations.kept.setdefault("device", {})
-        name = METHODS[method].code_name, str(thorough), str(fed)
+        name = METHODS[method].code_name, str(thorough), fed
         if (key := (self.device, *name)) not in held:
 
             def parts() -> tuple[Part, ...]:

@@ -118,9 +118,14 @@ class StateFeedback:
         return f"<StateFeedback of {nx} numbers to {nv} torques>"
 
     @property
+    def pattern(self) -> str:
+        """Which entries of the gain are not zero: their bits, row after row, as hexadecimal digits."""
+        return np.packbits(self.gain != 0).tobytes().hex()
+
+    @property
     def numbers(self) -> Array:
-        """Constant and gain of each torque, row after row, as compiled steps take them."""
-        return np.column_stack([self._constant, self.gain]).ravel()
+        """Constants, and entries of the gain that are not zero, as compiled steps take them."""
+        return np.append(self._constant, self.gain[self.gain != 0])
 
 
 class Policy:

@@ -14,12 +14,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
+from hashlib import sha256
 from itertools import groupby
 from math import frexp
 from operator import add, itemgetter
 from typing import Any, Final
 
 import casadi as ca
+import numpy as np
 
 from mbkit._check import Array
 from mbkit.derivation.equations import Equations
@@ -107,13 +109,13 @@ class Part:
         return cls(name, tuple(arguments), tuple(results), lambda: function_of(name, arguments, results))
 
 
-def march(equations: Equations, method: str, *, thorough: bool = False, fed: bool = False) -> tuple[Part, ...]:
+def march(equations: Equations, method: str, *, thorough: bool = False, fed: str = "") -> tuple[Part, ...]:
     """Return the step of `march_in_stages` as one part."""
     name = f"{_prefix(method, thorough, fed)}_march"
     reads = (*_MARCH, *equations.extra_arguments, *([LAW] if fed else []))
 
     def make() -> ca.Function:
-        known = _symbols(equations)
+        known = _symbols(equations, fed)
         given = {name: known[name] for name in reads}
         for part in march_in_stages(equations, method, thorough=thorough, fed=fed):
             known |= zip(part.writes, part.make().call([known[name] for name in part.reads]), strict=True)
@@ -132,31 +134,38 @@ def velocity_changes(equations: Equations) -> tuple[tuple[Part, ...], tuple[Part
     return (before,), (Part.of("body_velocity", {"q1": s["q"], "w1": s["w"]}, {"v1": v1}),)
 
 
-def _prefix(method: str, thorough: bool, fed: bool) -> str:
-    return method_of(method).code_name + ("_thorough" if thorough else "") + ("_fed" if fed else "")
+def _prefix(method: str, thorough: bool, fed: str) -> str:
+    gain = f"_fed_{sha256(fed.encode()).hexdigest()[:16]}" if fed else ""
+    return method_of(method).code_name + ("_thorough" if thorough else "") + gain
 
 
-def _fed(law: Any, q: Any, v: Any) -> Any:
-    """Return the torque of a state feedback with these numbers, constants and gains in rows."""
-    nv = v.numel()
-    rows = ca.reshape(law, law.numel() // nv, nv).T
-    return rows[:, 0] - rows[:, 1:] @ ca.vertcat(q, v)
+def _entries(fed: str, q: Any, v: Any) -> tuple[list[int], list[int]]:
+    """Return rows and columns of the entries of a state feedback's gain that are not zero."""
+    bits = np.unpackbits(np.frombuffer(bytes.fromhex(fed), dtype=np.uint8), count=v.numel() * (q.numel() + v.numel()))
+    rows, columns = np.nonzero(bits.reshape(v.numel(), -1))
+    return rows.tolist(), columns.tolist()
 
 
-def march_in_stages(
-    equations: Equations, method: str, *, thorough: bool = False, fed: bool = False
-) -> tuple[Part, ...]:
+def _fed(fed: str, law: Any, q: Any, v: Any) -> Any:
+    """Return the torque of a state feedback with these numbers, its constants and the entries of its gain."""
+    nv, x = v.numel(), ca.vertcat(q, v)
+    gain = ca.SX.triplet(*_entries(fed, q, v), law[nv:], nv, x.numel())
+    return law[:nv] - gain @ x
+
+
+def march_in_stages(equations: Equations, method: str, *, thorough: bool = False, fed: str = "") -> tuple[Part, ...]:
     """Return a step in the integrators' own velocity, for many in a row, cut at each evaluation of forward dynamics.
 
     It reads q, w, tau, dt, squares and writes q1, w1, squares1. The last is the sum of the squares of all states so
     far: a number that once was not finite, or beyond all bounds, shows in it for ever; so does a step that is lost to
     its constraints, as it is near a singular pose, or so long that its projection is not done. `thorough` projections
-    lose fewer steps. `fed`: it reads the numbers of a state feedback too, whose torque is added to tau.
+    lose fewer steps. `fed`: it reads the numbers of a state feedback too, whose torque is added to tau. They are those
+    of a gain with this `StateFeedback.pattern`, so that zeros cost nothing.
 
     The forward dynamics, most of the step, is compiled once and not for each stage. Between the parts go the stages'
     states (q_i, v_i) and accelerations a_i.
     """
-    s, space, formula = _symbols(equations), SymbolicSpace(equations.model), method_of(method).formula
+    s, space, formula = _symbols(equations, fed), SymbolicSpace(equations.model), method_of(method).formula
     assert isinstance(formula, (Tableau, SemiImplicitEuler))
     timed, held = equations.model.time_parameter is not None, equations.model.constrained
     known = {n: s[n] for n in ("q", "w", "dt")} | (equations.extra_arguments if held or timed else {})
@@ -177,7 +186,7 @@ def march_in_stages(
                 stage[more[0]] = at_time(equations, t)["parameters"]
         if fed:
             force = f"tau_{i}"
-            stage[force] = s["tau"] + _fed(s[LAW], q, v)
+            stage[force] = s["tau"] + _fed(fed, s[LAW], q, v)
         if stage:
             parts.append(Part.of(f"{prefix}_stage_{i}", known | own, stage))
         reads = (*at, force, *more)
@@ -213,13 +222,13 @@ def parts_of(
     operations: Callable[[Part], int],
     *,
     thorough: bool = False,
-    fed: bool = False,
+    fed: str = "",
     most: int = _MAX_OPERATIONS_IN_ONE_PIECE,
 ) -> tuple[Part, ...]:
     """Return the step in one part, or cut at its forward dynamics where these have more than `most` operations."""
     staged = march_in_stages(equations, method, thorough=thorough, fed=fed)
     forward = next(part for part in staged if part.name in DYNAMICS)
-    law = equations.model.nv * (equations.model.nq + equations.model.nv) if fed else 0
+    law = len(_entries(fed, equations.q, equations.v)[0]) if fed else 0
     if method_of(method).stages * (operations(forward) + law) > min(most, _MAX_OPERATIONS_IN_ONE_PIECE):
         return staged
     return march(equations, method, thorough=thorough, fed=fed)
@@ -233,9 +242,11 @@ def _held_dynamics(equations: Equations) -> ca.Function:
     return function_of("held_dynamics", dict(zip(forward.name_in(), (q, v, tau, *more), strict=True)), outs)
 
 
-def _symbols(equations: Equations) -> dict[str, Any]:
+def _symbols(equations: Equations, fed: str = "") -> dict[str, Any]:
     nq, nv = equations.model.nq, equations.model.nv
-    sizes = {"q": nq, "v": nv, "w": nv, "tau": equations.force.numel(), "dt": 1, "squares": 1, LAW: nv * (1 + nq + nv)}
+    sizes = {"q": nq, "v": nv, "w": nv, "tau": equations.force.numel(), "dt": 1, "squares": 1}
+    if fed:
+        sizes[LAW] = nv + len(_entries(fed, equations.q, equations.v)[0])
     return {**{name: ca.SX.sym(name, n) for name, n in sizes.items()}, **equations.extra_arguments}
 
 

@@ -34,7 +34,8 @@ def step_on_device(
     """
     dyn = problem.dyn
     assert isinstance(dyn, LagrangianDynamics)
-    steps = dyn._device_steps(problem.method, thorough=thorough, fed=problem.torque.feedback is not None)
+    law = problem.torque.feedback
+    steps = dyn._device_steps(problem.method, thorough=thorough, fed=law.pattern if law else "")
     squares = np.zeros(len(members))
 
     def run(part: slice) -> None:

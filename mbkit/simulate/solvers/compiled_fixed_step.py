@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -40,8 +41,8 @@ from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.solvers.vector_field import BOUND, are_bounded
 from mbkit.simulate.time_grid import Indices
 
-#: Number of samples between two reports of how far a run is.
-_SAMPLES_PER_REPORT: Final = 64
+#: Number of steps between two reports of how far a run is.
+_STEPS_PER_REPORT: Final = 64
 #: Most steps of a block: as many as have room in the cache, so that Python has little to do for each.
 _MAX_BLOCK_STEPS: Final = 2048
 #: Most states of a chunk.
@@ -148,6 +149,7 @@ def run_rollout(
     w0, values = space.to_integrator_velocity(problem.q, problem.v), dyn._parameter_values
     clock = None if dyn.model.time_parameter is None else list(dyn.model.parameters).index(dyn.model.time_parameter)
     law = problem.torque.feedback
+    fed = law.pattern if law else ""
     workers = workers or dyn.threads or cores()
     # Every block costs some calls: worth it for a state now and then, not for most.
     dense = 2 * len(record.kept) > grid.steps
@@ -173,7 +175,7 @@ def run_rollout(
 
             squares = step_on_device(problem, record, w0, members, thorough=thorough)
             return members[~(squares < BOUND**2)]
-        plan = dyn._step_plan(method, thorough=thorough, fed=law is not None, behind=behind)
+        plan = dyn._step_plan(method, thorough=thorough, fed=fed, behind=behind)
 
         def new_loop(width: int) -> Callable[[Indices], Chunk]:
             return partial(begin, new_chunk(plan, width, all_kept=dense))
@@ -199,7 +201,7 @@ def run_rollout(
                 margins[suspects] = np.nan
             return run_fixed(problem, record, suspects)
     if len(suspects):
-        plan = dyn._step_plan(method, fed=law is not None)
+        plan = dyn._step_plan(method, fed=fed)
         for first in range(0, len(suspects), _widest(plan)):
             members = suspects[first : first + _widest(plan)]
             chunk = begin(new_chunk(plan, len(members), all_kept=True, watched=True), members)
@@ -237,30 +239,31 @@ def _run_step_by_step(problem: IntegrationProblem) -> SolverResult:
     kept = iter(record.kept[row:].tolist())
     all_q, all_v, following = record.q[0], record.v[0], next(kept, -1)
     k = s = sample = 0
-    new, shorter = False, steps - 1 if grid.last != dt else steps
+    new = False
     try:
-        for k in range(steps):
-            if k == sample:
-                # Copies: the function may write into them.
-                force = ask(start + k * dt, q.copy(), v.copy())
-                if step is None:
-                    forces[s, :nv] = controller.checked(force, start + k * dt)
-                    force = forces[s]
-                if not s % _SAMPLES_PER_REPORT:
-                    problem.bar.update(k / steps)
-                s, new = s + 1, True
-                sample = begins[s]
-            state = None if step is None else step(q, v, force, dt, 0.0)
-            if state is None or k == shorter:
-                if step is not None:
-                    force = controller.checked(force, start + k * dt)
-                state = dyn.step(q, v, force, grid.step(k), method, t=grid.time(k) if timed else None)
-            if new:
-                forces[s - 1], new = force, False
-            q, v = state
-            if k + 1 == following:
-                all_q[row], all_v[row] = q, v
-                row, following = row + 1, next(kept, -1)
+        for first, end in pairwise(sorted({*range(0, steps, _STEPS_PER_REPORT), max(steps - 1, 0), steps})):
+            h = grid.step(first)
+            problem.bar.update(first / steps)
+            for k in range(first, end):
+                if k == sample:
+                    # Copies: the function may write into them.
+                    force = ask(start + k * dt, q.copy(), v.copy())
+                    if step is None:
+                        forces[s, :nv] = controller.checked(force, start + k * dt)
+                        force = forces[s]
+                    s, new = s + 1, True
+                    sample = begins[s]
+                state = None if step is None else step(q, v, force, h, 0.0)
+                if state is None:
+                    if step is not None:
+                        force = controller.checked(force, start + k * dt)
+                    state = dyn.step(q, v, force, h, method, t=grid.time(k) if timed else None)
+                if new:
+                    forces[s - 1], new = force, False
+                q, v = state
+                if k + 1 == following:
+                    all_q[row], all_v[row] = state
+                    row, following = row + 1, next(kept, -1)
         k = steps
         problem.bar.update(1.0)
     except TorqueError as failed:
