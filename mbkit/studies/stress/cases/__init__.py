@@ -14,7 +14,7 @@ from mbkit.studies.stress.cases import springs, rigid, loops, rubbing  # noqa: F
 __all__ = ["CASES", "get", "names"]
 
 #: Name -> case, family by family.
-CASES: Final[dict[str, Case]] = {c.name: c for c in sorted(TABLE, key=lambda c: get_args(Family).index(c.family))}
+CASES: Final = dict(sorted(TABLE.items(), key=lambda item: get_args(Family).index(item[1].family)))
 
 
 def names() -> tuple[str, ...]:

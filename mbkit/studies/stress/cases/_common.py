@@ -1,8 +1,9 @@
-"""What the families of cases share: their table, values over decades, and problems of motions and of terms."""
+"""Decorator of cases, values over decades, and problems of motions and of terms."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 from functools import partial
 from typing import Any, Final, TypeVar
 
@@ -20,37 +21,32 @@ Facts = dict[str, float]
 
 #: The axis of a hinge about which a body that hangs down swings.
 SWING: Final = (0.0, -1.0, 0.0)
-#: All cases, as the modules of this package write them down.
-TABLE: Final[list[Case]] = []
+#: All cases by name, as the modules of this package add them.
+TABLE: Final[dict[str, Case]] = {}
 
 
-class Series:
-    """What the cases of one sweep have in common; it decorates the function that makes the problems of one."""
+def case(
+    family: Family,
+    parameter: str,
+    unit: str,
+    values: tuple[float, ...],
+    quick: tuple[float, ...],
+    name: str = "",
+    about: str = "",
+    **more: Any,
+) -> Callable[[Make], Make]:
+    """Return a decorator that adds a case, whose problems a function makes.
 
-    def __init__(
-        self,
-        family: Family,
-        parameter: str,
-        unit: str,
-        values: tuple[float, ...],
-        quick: tuple[float, ...],
-        **more: Any,
-    ) -> None:
-        self._swept, self._more = (family, parameter, unit, values, quick), more
-
-    def __call__(self, make: Make) -> Make:
-        return rows(self.row(make.__name__, " ".join((make.__doc__ or "").split())))(make)
-
-    def row(self, name: str, about: str, **numbers: Any) -> Callable[[Callable[..., Problem]], Case]:
-        """Return a case but for the function that makes its problems, which gets these numbers besides the value."""
-        return lambda make: Case(name, about, *self._swept, partial(make, **numbers), **self._more)
-
-
-def rows(*some: Callable[[Callable[..., Problem]], Case]) -> Callable[[Make], Make]:
-    """Return a decorator that adds the cases of these rows, whose problems the function makes."""
+    The function's name and docstring are the case's where no others are given. `more` are attributes of the `Case`, and
+    arguments that the function gets besides the value.
+    """
+    options = {f.name: more.pop(f.name) for f in fields(Case) if f.name in more}
 
     def add(make: Make) -> Make:
-        TABLE.extend(row(make) for row in some)
+        known = name or make.__name__
+        assert known not in TABLE, f"two cases have the name {known}"
+        text = about or " ".join((make.__doc__ or "").split())
+        TABLE[known] = Case(known, text, family, parameter, unit, values, quick, partial(make, **more), **options)
         return make
 
     return add
@@ -70,19 +66,11 @@ def powers(first: int, last: int, step: int = 1) -> tuple[float, ...]:
 
 
 def motion(
-    model: Model,
-    q: ArrayLike,
-    v: ArrayLike,
-    duration: float,
-    exact: Exact,
-    floor: float,
-    source: str,
-    facts: Facts | None = None,
-    **more: Any,
+    model: Model, q: ArrayLike, v: ArrayLike, duration: float, exact: Exact, floor: float, source: str, **more: Any
 ) -> Problem:
     """Return the problem of a motion with a closed form; 0 for `v` is a start at rest."""
     v = np.zeros(model.nv) + np.asarray(v, dtype=np.float64)
-    return Problem(model, np.asarray(q), v, None, duration, exact, floor, source, facts=facts or {}, **more)
+    return Problem(model, np.asarray(q), v, None, duration, exact, floor, source, **more)
 
 
 def terms_at(model: Model, *, samples: int = 8, force: float = 1.0, facts: Facts | None = None) -> Problem:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -19,12 +19,12 @@ from mbkit.engines.registry import PINOCCHIO
 from mbkit.model import Model, ModelBuilder
 from mbkit.model.parts import Prescribed
 from mbkit.studies.measurement import Problem
-from mbkit.studies.stress.cases._common import Series, motion, powers, rows
+from mbkit.studies.stress.cases._common import case, motion, powers
 
 #: Crank, coupler and rocker of the four-bar that is cut down to a change point, m.
 _CRANK, _COUPLER, _ROCKER = 0.3, 0.9, 0.7
-_near = Series(
-    *("near-singular", "distance", "m", powers(-1, -7), (1e-1, 1e-3, 1e-5)),
+_near = partial(
+    *(case, "near-singular", "distance", "m", powers(-1, -7), (1e-1, 1e-3, 1e-5)),
     measure="energy",
     bar=1e-6,
     why="what a run loses where rows nearly depend on each other shows in its energy",
@@ -46,13 +46,13 @@ def pose(theta: Array, ground: float) -> Array:
     return np.asarray(angles(theta) - angles(np.zeros(1)) * [0.0, 1.0, 1.0])
 
 
-def _moving(model: Model, q: ArrayLike, v: ArrayLike, duration: float, **facts: float) -> Problem:
+def _moving(model: Model, q: ArrayLike, v: ArrayLike, duration: float) -> Problem:
     """Return the problem of a motion that begins near a state, and is judged by its energy."""
     start = states_of(model).manifold.project(np.array(q, dtype=np.float64), np.array(v, dtype=np.float64))
-    return Problem(model, *start, duration=duration, facts=facts)
+    return Problem(model, *start, duration=duration)
 
 
-@_near
+@_near()
 def change_point(distance: float) -> Problem:
     """A four-bar swings past the pose in which its rods would lie in line if the ground were shorter by so much."""
     ground = _COUPLER + _CRANK - _ROCKER + distance
@@ -61,7 +61,7 @@ def change_point(distance: float) -> Problem:
     return _moving(model, pose(np.array([1.5]), ground)[0], [-3.0, 3.0, 0.0], 1.0)
 
 
-@_near
+@_near()
 def dead_centre(distance: float) -> Problem:
     """A slider-crank turns past the pose in which its piston stands nearly on the crank's axis."""
     # Crank and rod of equal lengths fold onto each other there, and the piston could stand still from then on.
@@ -69,7 +69,7 @@ def dead_centre(distance: float) -> Problem:
     return _moving(model, [0.0, 0.0, 0.0], [2.0, -4.0, 0.0], 2.0)
 
 
-@Series(
+@case(
     *("mass ratio", "one bar over the others", "", powers(0, 9), (1.0, 1e3, 1e6)),
     measure="energy",
     bar=1e-6,
@@ -81,15 +81,37 @@ def heavy_bricard(ratio: float) -> Problem:
     first, *others = model.bodies
     heavy = replace(first, mass=ratio * first.mass, inertia=ratio * first.inertia)
     model = replace(model, bodies=(heavy, *others))
-    q = model.neutral()
-    return _moving(model, q, np.zeros(model.nv), 1.0)
+    return _moving(model, model.neutral(), np.zeros(model.nv), 1.0)
 
 
 # Loops that hold what others hold already, but for so much: at 0 the mechanism would move, and it stands still
 
+_Y, _Z = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+#: At the last values rows count as equal: one more freedom is left, as the facts say, and the motion is that of 0.
+_redundant = partial(
+    *(case, "near-singular", "apart", "", (*powers(-1, -10, 3), 1e-11, 1e-12), (1e-1, 1e-4, 1e-7)),
+    measure="terms",
+    bar=1e3 * EPS,
+    why="accelerations lose digits with the condition of the rows in the metric of the mass matrix, which divides them",
+)
 
-def _cranks(b: ModelBuilder, apart: float) -> None:
-    """Add three cranks under a plate, of which the third is turned by so much against the others."""
+
+def _nearly_redundant(model: Model) -> Problem:
+    """Return the accelerations of a mechanism from rest, under random forces."""
+    tau = np.random.default_rng(0).standard_normal((1, model.nv))
+    facts = {"freedoms": model.nv - len(choose_rows(model).independent)}
+    return Problem(model, model.neutral()[None], 0 * tau, tau, scale=condition_of_rows(model), facts=facts)
+
+
+def _bar(b: ModelBuilder, name: str, parent: str, axis: ArrayLike, place: ArrayLike, tip: ArrayLike) -> None:
+    b.add_body(name, mass=1.0, com=0.5 * np.asarray(tip), inertia=(0.01, 0.01, 0.01))
+    b.add_joint(f"{name} hinge", "revolute", parent=parent, child=name, axis=axis, translation=place)
+
+
+@_redundant()
+def cranks(apart: float) -> Problem:
+    """Three cranks carry a plate, and one differs by so much, m or rad."""
+    b = ModelBuilder("nearly_redundant")
     tips = [(0.3 * math.sin(angle), 0.0, 0.3 * math.cos(angle)) for angle in (0.4, 0.4, 0.4 + apart)]
     for k, tip in enumerate(tips):
         _bar(b, f"crank{k}", "world", _Y, (0.5 * k, 0.0, 0.0), tip)
@@ -97,10 +119,13 @@ def _cranks(b: ModelBuilder, apart: float) -> None:
     for k in (1, 2):
         on = tuple(0.5 * k * (i == 0) + x - y for i, (x, y) in enumerate(zip(tips[k], tips[0], strict=True)))
         b.add_loop(f"loop{k}", "point", body_a=f"crank{k}", translation_a=tips[k], body_b="plate", translation_b=on)
+    return _nearly_redundant(b.build())
 
 
-def _neck(b: ModelBuilder, apart: float) -> None:
-    """Add a robot's neck: a crank on a plate, turned by two rods beside the plate, each welded to its pin."""
+@_redundant()
+def neck(apart: float) -> Problem:
+    """Two rods beside a plate turn a crank, each welded to its pin."""
+    b = ModelBuilder("nearly_redundant")
     top, lever = np.array([-0.033, -0.027, 0.0]), np.array([0.002, 0.007, 0.0])
     _bar(b, "plate", "world", _Z, (0, 0, 0), top)
     _bar(b, "crank", "plate", _Z, top, lever)
@@ -108,11 +133,15 @@ def _neck(b: ModelBuilder, apart: float) -> None:
         _bar(b, f"pin{k}", "crank", _Z, end, -end)
         _bar(b, f"rod{k}", "world", _Z, foot, top + end - foot)
         b.add_loop(f"weld{k}", "frame", body_a=f"rod{k}", translation_a=top + end - foot, body_b=f"pin{k}")
+    return _nearly_redundant(b.build())
 
 
-def _bennett(b: ModelBuilder, apart: float) -> None:
-    """Add Bennett's mechanism of four bars, whose hinges are square to both their bars, but for a turn of one."""
-    # A skew quadrilateral whose opposite sides are equal (Bennett 1914, The skew isogram mechanism).
+@_redundant()
+def bennett(apart: float) -> Problem:
+    """Bennett's mechanism, of six rows three, with one hinge turned."""
+    # A skew quadrilateral whose opposite sides are equal (Bennett 1914, The skew isogram mechanism); its hinges are
+    # square to both their bars.
+    b = ModelBuilder("nearly_redundant")
     corners = np.array([[0.5, 0.1, 0.2], [0.1, 0.4, -0.2], [-0.5, -0.1, 0.2], [-0.1, -0.4, -0.2]])
     sides = np.roll(corners, -1, axis=0) - corners
     axes = np.cross(np.roll(sides, 1, axis=0), sides)
@@ -121,73 +150,31 @@ def _bennett(b: ModelBuilder, apart: float) -> None:
         place = sides[k - 1] if k else corners[0]
         _bar(b, f"bar{k}", f"bar{k - 1}" if k else "world", axes[k] / np.linalg.norm(axes[k]), place, sides[k])
     b.add_loop("closed", "frame", body_a="bar3", body_b="world", translation_b=corners[3])
+    return _nearly_redundant(b.build())
 
 
-_Y, _Z = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-
-
-def _bar(b: ModelBuilder, name: str, parent: str, axis: ArrayLike, place: ArrayLike, tip: ArrayLike) -> None:
-    b.add_body(name, mass=1.0, com=0.5 * np.asarray(tip), inertia=(0.01, 0.01, 0.01))
-    b.add_joint(f"{name} hinge", "revolute", parent=parent, child=name, axis=axis, translation=place)
-
-
-def _bricard(apart: float) -> Model:
-    """Return Bricard's mechanism with its second hinge turned by so much."""
+@_redundant()
+def bricard_turned(apart: float) -> Problem:
+    """Bricard's mechanism, of six rows five, with one hinge turned."""
     model = catalog.bricard()
     axes = np.array([[apart, 1.0, 0.0]]) / math.hypot(apart, 1.0)
-    return replace(model, joints=tuple(replace(x, axes=axes) if x.name == "q2" else x for x in model.joints))
+    turned = (replace(x, axes=axes) if x.name == "q2" else x for x in model.joints)
+    return _nearly_redundant(replace(model, joints=tuple(turned)))
 
 
-def _delta(apart: float) -> Model:
-    """Return the robot Delta with a third rod between a pair, whose lower end is so far out of their plane."""
+@_redundant()
+def delta_robot(apart: float) -> Problem:
+    """Delta with a third rod between two parallel ones."""
     model = catalog.delta_robot()
-    out = np.array([apart, 0.0, 0.0])
+    # Its lower end is so far out of their plane.
+    out, aside = np.array([apart, 0.0, 0.0]), np.array([1.0, 0.0, 1.0])
     body = next(x for x in model.bodies if x.name == "rod1a")
     joint, loop = model.joint("rod1a"), next(x for x in model.loops if x.name == "ball1a")
-    aside = np.array([1.0, 0.0, 1.0])
-    upper, lower = loop.translation_a + out, aside * loop.translation_b + out
+    ends = {"translation_a": loop.translation_a + out, "translation_b": aside * loop.translation_b + out}
     middle = replace(joint, name="rod1c", child="rod1c", translation=aside * joint.translation)
-    return replace(
-        model,
-        bodies=(*model.bodies, replace(body, name="rod1c")),
-        joints=(*model.joints, middle),
-        loops=(*model.loops, replace(loop, name="ball1c", body_a="rod1c", translation_a=upper, translation_b=lower)),
-    )
-
-
-#: At the last values rows count as equal: one more freedom is left, as the facts say, and the motion is that of 0.
-_redundant = Series(
-    *("near-singular", "apart", "", (*powers(-1, -10, 3), 1e-11, 1e-12), (1e-1, 1e-4, 1e-7)),
-    measure="terms",
-    bar=1e3 * EPS,
-    why="accelerations lose digits with the condition of the rows in the metric of the mass matrix, which divides them",
-)
-
-
-@rows(
-    _redundant.row("cranks", "Three cranks carry a plate, and one differs by so much, m or rad.", add=_cranks),
-    _redundant.row("neck", "Two rods beside a plate turn a crank, each welded to its pin.", add=_neck),
-    _redundant.row("bennett", "Bennett's mechanism, of six rows three, with one hinge turned.", add=_bennett),
-    _redundant.row("bricard_turned", "Bricard's mechanism, of six rows five, with one hinge turned.", make=_bricard),
-    _redundant.row("delta_robot", "Delta with a third rod between two parallel ones.", make=_delta),
-)
-def nearly_redundant(
-    apart: float, add: Callable[[ModelBuilder, float], None] | None = None, make: Callable[[float], Model] | None = None
-) -> Problem:
-    """Return the accelerations of a mechanism from rest, under random forces."""
-    if make is not None:
-        model = make(apart)
-    else:
-        b = ModelBuilder("nearly_redundant")
-        assert add is not None
-        add(b, apart)
-        model = b.build()
-    q, v = model.neutral()[None], np.zeros((1, model.nv))
-    tau, facts = (
-        np.random.default_rng(0).standard_normal((1, model.nv)),
-        {"freedoms": model.nv - len(choose_rows(model).independent)},
-    )
-    return Problem(model, q, v, tau, scale=condition_of_rows(model), facts=facts)
+    loops = (*model.loops, replace(loop, name="ball1c", body_a="rod1c", **ends))
+    bodies, joints = (*model.bodies, replace(body, name="rod1c")), (*model.joints, middle)
+    return _nearly_redundant(replace(model, bodies=bodies, joints=joints, loops=loops))
 
 
 def condition_of_rows(model: Model) -> float:
@@ -202,7 +189,7 @@ def condition_of_rows(model: Model) -> float:
 _AMPLITUDE, _FREQUENCY = 0.1, 3.0
 
 
-@Series("stiffness", "stiffness", "N/m", powers(2, 12), (1e2, 1e6, 1e10))
+@case("stiffness", "stiffness", "N/m", powers(2, 12), (1e2, 1e6, 1e10))
 def stiff_drive(stiffness: float) -> Problem:
     """A mass of 1 kg on a spring follows a carriage whose motion is prescribed, for 2 s."""
     b, along = ModelBuilder("driven_mass", gravity=(0.0, 0.0, 0.0)), (1.0, 0.0, 0.0)
@@ -218,9 +205,9 @@ def stiff_drive(stiffness: float) -> Problem:
     def exact(t: Array) -> Array:
         return np.asarray(np.multiply.outer(np.sin(_FREQUENCY * t), size))
 
-    facts = {"fastest frequency, rad/s": math.sqrt(stiffness)}
-    source = "steady motion of a linear system"
-    return motion(b.build(), [0.0, 0.0], _FREQUENCY * size, 2.0, exact, 16 * EPS * _AMPLITUDE, source, facts, scale=0.1)
+    source, facts = "steady motion of a linear system", {"fastest frequency, rad/s": math.sqrt(stiffness)}
+    v, floor = _FREQUENCY * size, 16 * EPS * _AMPLITUDE
+    return motion(b.build(), [0.0, 0.0], v, 2.0, exact, floor, source, facts=facts, scale=_AMPLITUDE)
 
 
 #: Speed of a crank that turns steadily, rad/s, and its ground, m; the four-bar of `validation.four_bar` has the same.
@@ -228,7 +215,7 @@ _RATE, _GROUND = 5.0, 1.0
 _STEP: Final = 4e-3
 
 
-@Series(
+@case(
     *("long", "steps", "", powers(3, 6), (1e3, 1e4, 1e5)),
     methods=("rk4", "semi_implicit_euler", "gauss4"),
     patience=6.0,
@@ -241,9 +228,7 @@ def driven_loop(steps: float) -> Problem:
     def exact(t: Array) -> Array:
         return pose(_RATE * t, _GROUND)
 
-    first = exact(np.array([1e-4, -1e-4]))
-    guess = (first[0] - first[1]) / 2e-4
-    _, v = states_of(model).manifold.project(np.zeros(3), guess)
+    ahead, behind = exact(np.array([1e-4, -1e-4]))
+    _, v = states_of(model).manifold.project(np.zeros(3), (ahead - behind) / 2e-4)
     floor = 16 * EPS * (1 + _RATE * steps * _STEP)
-    source = "two triangles"
-    return motion(model, np.zeros(3), v, steps * _STEP, exact, floor, source, dt=_STEP)
+    return motion(model, np.zeros(3), v, steps * _STEP, exact, floor, "two triangles", dt=_STEP)

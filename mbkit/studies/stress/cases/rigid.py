@@ -18,17 +18,18 @@ from mbkit.model import Body, Model, ModelBuilder
 from mbkit.studies.measurement import Problem
 from mbkit.studies.motions import exact as exact_motions
 from mbkit.studies.motions.exact import Exact
-from mbkit.studies.stress.cases._common import SWING, Facts, Series, motion, powers, rows, terms_at
+from mbkit.studies.stress.cases._common import SWING, Facts, case, motion, powers, terms_at
 
 # Heavy beside light: masses that differ along a chain, and in a robot's hand
 
-_masses = partial(Series, "mass ratio")
+_masses = partial(case, "mass ratio")
 
 _UP: Final = (powers(0, 9), (1.0, 1e3, 1e6, 1e9))
 _DOWN: Final = (powers(0, -9), (1.0, 1e-3, 1e-6, 1e-9))
 _UPWARD: Final = ("last over first mass", "", *_UP)
 _DOWNWARD: Final = ("last over first mass", "", *_DOWN)
 _LOADED: Final = ("load", "kg", *_UP)
+_TERMS: Final[dict[str, Any]] = {"measure": "terms", "terms": True}
 
 
 def rods(name: str, masses: Sequence[float], load_mass: float = 0.0) -> Model:
@@ -55,43 +56,36 @@ def _terms(model: Model) -> Problem:
     return terms_at(model, facts=_facts(model))
 
 
-@rows(
-    _masses(*_UPWARD).row(
-        "heavy_tip", "A taut chain of five rods, each heavier than the one above, swings from 0.5 rad for 1 s."
-    ),
-    _masses(*_UPWARD, measure="terms").row(
-        "heavy_tip_terms", "Terms of a chain of five rods, each heavier than the one above.", terms=True
-    ),
-    _masses(*_DOWNWARD).row(
-        *("light_tip", "A chain of five rods, each lighter than the one above, swings from 0.5 rad for 1 s."),
-        taut=False,
-    ),
-    _masses(*_DOWNWARD, measure="terms").row(
-        "light_tip_terms", "Terms of a chain of five rods, each lighter than the one above.", terms=True
-    ),
-    _masses(*_LOADED).row(
-        "loaded_arm", "A taut arm of three rods of 1 kg swings from 0.5 rad for 1 s with a load at its end.", arm=True
-    ),
-    _masses(*_LOADED, measure="terms").row(
-        "loaded_arm_terms", "Terms of an arm of three rods of 1 kg with a load at its end.", arm=True, terms=True
-    ),
+@_masses(
+    *(*_LOADED, "loaded_arm_terms", "Terms of an arm of three rods of 1 kg with a load at its end."), arm=True, **_TERMS
+)
+@_masses(
+    *(*_LOADED, "loaded_arm", "A taut arm of three rods of 1 kg swings from 0.5 rad for 1 s with a load at its end."),
+    arm=True,
+)
+@_masses(*_DOWNWARD, "light_tip_terms", "Terms of a chain of five rods, each lighter than the one above.", **_TERMS)
+@_masses(
+    *(*_DOWNWARD, "light_tip", "A chain of five rods, each lighter than the one above, swings from 0.5 rad for 1 s."),
+    taut=False,
+)
+@_masses(*_UPWARD, "heavy_tip_terms", "Terms of a chain of five rods, each heavier than the one above.", **_TERMS)
+@_masses(
+    *_UPWARD, "heavy_tip", "A taut chain of five rods, each heavier than the one above, swings from 0.5 rad for 1 s."
 )
 def _chain(value: float, *, arm: bool = False, terms: bool = False, taut: bool = True) -> Problem:
     """Return an arm with a load, or five rods, each by the same factor heavier than the one before.
 
     Unless its terms are asked for, it is let go at rest, its first rod half a radian from below, for 1 s.
     """
-    name, masses, load_mass = "graded_chain", [value ** (i / 4 - 0.5) for i in range(5)], 0.0
-    if arm:
-        name, masses, load_mass = "loaded_arm", [1.0, 1.0, 1.0], value
-    model = rods(name, masses, load_mass)
+    masses, load_mass = ([1.0, 1.0, 1.0], value) if arm else ([value ** (i / 4 - 0.5) for i in range(5)], 0.0)
+    model = rods("loaded_arm" if arm else "graded_chain", masses, load_mass)
     if terms:
         return _terms(model)
     chain, angle = exact_motions.HangingChain(masses, load_mass), 0.5
     q = chain.taut(angle) if taut else np.array([angle, *[0.0] * (len(masses) - 1)])
     source = "collocation in angles from the vertical, Radau IIA of order 15"
     # The error was measured against Taylor series with 34 digits.
-    return motion(model, q, 0.0, 1.0, chain.motion(q, 1.0), 1e-11, source, _facts(model))
+    return motion(model, q, 0.0, 1.0, chain.motion(q, 1.0), 1e-11, source, facts=_facts(model))
 
 
 @_masses(*_LOADED, measure="terms")
@@ -147,7 +141,7 @@ def straight_inertia(n: int) -> Array:
 
 
 # The longest take a minute to derive, with 34 digits.
-@Series("length", "rods", "", _LENGTHS, (2.0, 8.0, 32.0), measure="terms", patience=6.0)
+@case("length", "rods", "", _LENGTHS, (2.0, 8.0, 32.0), measure="terms", patience=6.0)
 def chain(n: float) -> Problem:
     """Terms of a planar chain of thin rods, straight and bent: its condition number grows as the fourth power."""
     count = round(n)
@@ -158,7 +152,7 @@ def chain(n: float) -> Problem:
 
 # Fast turns, and many of them
 
-_spin = partial(Series, "spin")
+_spin = partial(case, "spin")
 _SPINS: Final = (powers(0, 6), (1.0, 1e2, 1e4, 1e6))
 #: The spin of Gazebo's "boxes" benchmark, complex case without gravity: nearly about the middle axis, rad/s.
 _BOX_SPIN: Final = (0.1, 5.0, 0.1)
@@ -171,9 +165,9 @@ def heavy_top(spin: float) -> Problem:
     mass, radius, g = 15.0, 1.0, 9.81
     across, along = 0.234375 + mass * radius**2, 0.46875
     exact, q, v, rate = exact_motions.precession(spin, 2 * np.pi / 3, mass * g * radius, across, along)
-    facts = {"fastest rate, 1/s": spin, "precession, rad/s": rate}
-    source = "steady precession, Landau, Lifshitz 1976, §35"
-    return motion(catalog.heavy_top(), q, v, 1.0, exact, 8 * EPS * (1 + spin), source, facts)
+    source, facts = "steady precession, Landau, Lifshitz 1976, §35", {"fastest rate, 1/s": spin}
+    facts["precession, rad/s"] = rate
+    return motion(catalog.heavy_top(), q, v, 1.0, exact, 8 * EPS * (1 + spin), source, facts=facts)
 
 
 def box_spin() -> tuple[Exact, float]:
@@ -193,7 +187,7 @@ def tumbling(place: Array, velocity: Array, duration: float) -> Problem:
     floor = 16 * EPS * (1 + float(np.linalg.norm(_BOX_SPIN)) * duration) + EPS * float(np.abs(place).max())
     source, facts = "free rotation by elliptic functions, Landau, Lifshitz 1976, §37", {"flips": 2 * duration / period}
     # No attitude is farther than π from another.
-    return motion(catalog.free_body(), q, v, duration, exact, floor, source, facts, scale=np.pi)
+    return motion(catalog.free_body(), q, v, duration, exact, floor, source, facts=facts, scale=np.pi)
 
 
 def _ball(spin: float, duration: float, **more: Any) -> Problem:
@@ -201,10 +195,10 @@ def _ball(spin: float, duration: float, **more: Any) -> Problem:
     b = ModelBuilder("ball", gravity=(0.0, 0.0, 0.0))
     b.add_body("ball", mass=1.0, inertia=(0.4, 0.4, 0.4))
     b.add_joint("turn", "ball", parent="world", child="ball")
-    q, axis = np.array([0.0, 0.0, 0.0, 1.0]), np.array([1.0, 2.0, 2.0]) / 3
+    q, axis, source = np.array([0.0, 0.0, 0.0, 1.0]), np.array([1.0, 2.0, 2.0]) / 3, "steady turn about one axis"
     exact, floor = exact_motions.turning(axis, spin), 8 * EPS * (1 + spin * duration)
-    facts = {"fastest rate, 1/s": spin, "turns": spin * duration / (2 * np.pi)}
-    return motion(b.build(), q, spin * axis, duration, exact, floor, "steady turn about one axis", facts, **more)
+    more["facts"] = {"fastest rate, 1/s": spin, "turns": spin * duration / (2 * np.pi)}
+    return motion(b.build(), q, spin * axis, duration, exact, floor, source, **more)
 
 
 @_spin("spin", "rad/s", *_SPINS)
@@ -233,7 +227,7 @@ def quaternion_drift(steps: float) -> Problem:
 
 # Poses at which something divides by nearly nothing
 
-_near = partial(Series, "near-singular")
+_near = partial(case, "near-singular")
 
 
 def _suspended(inertia: tuple[float, float, float]) -> Model:
@@ -258,7 +252,7 @@ def gimbal_pass(distance: float) -> Problem:
     model, speed = _suspended((0.1, 0.1, 0.1)), 2.5
     exact, v = exact_motions.past_gimbal_lock(distance, speed)
     facts = {"fastest rate, 1/s": speed / math.sin(distance)}
-    return motion(model, np.zeros(3), v, 1.0, exact, 64 * EPS, "steady turn about one axis, in angles", facts)
+    return motion(model, np.zeros(3), v, 1.0, exact, 64 * EPS, "steady turn about one axis, in angles", facts=facts)
 
 
 @_near("distance", "rad", powers(0, -12, 2), (1.0, 1e-6, 1e-12), measure="terms")
@@ -298,7 +292,7 @@ def massless_crank(distance: float) -> Problem:
     # The way left is known to eps of the way, and the angle goes with its root.
     floor, facts = 8 * EPS * (1 + 1 / distance), {"inertia at the end, kg m²": (r * lever(distance)) ** 2}
     source, v = "a piston without force moves steadily", -speed / (r * lever(first))
-    return motion(model, np.array([first]), v, duration, exact, floor, source, facts)
+    return motion(model, np.array([first]), v, duration, exact, floor, source, facts=facts)
 
 
 @_near("mass of the middle rod", "kg", powers(0, -18, 2), (1.0, 1e-6, 1e-12, 1e-18), measure="terms")
@@ -309,7 +303,7 @@ def massless_link(mass: float) -> Problem:
 
 # Numbers that are large, or very small, though the motion is an ordinary one
 
-_large = partial(Series, "large")
+_large = partial(case, "large")
 
 _FAR: Final = ((1.0, 1e2, 1e4, 1e6, 1e7, 1e8, 1e9), (1.0, 1e4, 1e7, 1e9))
 _PLACE: Final = np.array([1.0, -1.0, 0.5])
@@ -326,19 +320,20 @@ def many_turns(angle: float) -> Problem:
         # The rounded angle less its whole turns.
         apart = float(mp.mpf(start) - turns * turn)
     swing = exact_motions.pendulum(apart, 0.0, 9.81)
-    floor, facts = EPS * start + 1e-14, {"spacing of doubles there, rad": math.ulp(start)}
-    return motion(catalog.pendulum(), [start], 0.0, 2.0, lambda t: start + (swing(t) - apart), floor, _PENDULUM, facts)
+    return motion(
+        *(catalog.pendulum(), [start], 0.0, 2.0, lambda t: start + (swing(t) - apart), EPS * start + 1e-14, _PENDULUM),
+        facts={"spacing of doubles there, rad": math.ulp(start)},
+    )
 
 
 @_large("place", "m", *_FAR)
 def far_on_rail(place: float) -> Problem:
     """A cart-pole falls from 2 rad for 2 s, far out on its rail."""
     theta, start = 2.0, np.array([place, 0.0])
-    falling = exact_motions.cart_pole(theta, 1.0)
-    floor, facts = EPS * place + 1e-12, {"spacing of doubles there, m": math.ulp(place)}
-    model, source = catalog.cart_pole(), "energy and momentum with a quadrature"
-    q = np.array([place, theta])
-    return motion(model, q, 0.0, 2.0, lambda t: falling(t) + start, floor, source, facts, scale=2 * theta)
+    falling, source = exact_motions.cart_pole(theta, 1.0), "energy and momentum with a quadrature"
+    more: dict[str, Any] = {"facts": {"spacing of doubles there, m": math.ulp(place)}, "scale": 2 * theta}
+    floor, q = EPS * place + 1e-12, np.array([place, theta])
+    return motion(catalog.cart_pole(), q, 0.0, 2.0, lambda t: falling(t) + start, floor, source, **more)
 
 
 @_large("place", "m", *_FAR)
@@ -357,18 +352,15 @@ def far_base_terms(place: float) -> Problem:
     return replace(problem, q=q, facts={"spacing of doubles there, m": math.ulp(place)})
 
 
-def _swing(
-    model: Model, gravity: float, speed: float, duration: float, floor: float, facts: Facts | None = None
-) -> Problem:
+def _swing(model: Model, gravity: float, speed: float, duration: float, floor: float, **more: Any) -> Problem:
     """Return a pendulum of 1 m that starts at 1 rad."""
-    return motion(
-        model, np.ones(1), speed, duration, exact_motions.pendulum(1.0, speed, gravity), floor, _PENDULUM, facts
-    )
+    exact = exact_motions.pendulum(1.0, speed, gravity)
+    return motion(model, np.ones(1), speed, duration, exact, floor, _PENDULUM, **more)
 
 
 def _under_gravity(gravity: float, speed: float, duration: float) -> Problem:
     floor, facts = 16 * EPS * (1 + math.sqrt(gravity) * duration), {"fastest frequency, rad/s": math.sqrt(gravity)}
-    return _swing(catalog.pendulum(gravity=gravity), gravity, speed, duration, floor, facts)
+    return _swing(catalog.pendulum(gravity=gravity), gravity, speed, duration, floor, facts=facts)
 
 
 @_large("gravity", "m/s²", powers(0, 6), (1.0, 1e3, 1e6))
@@ -393,22 +385,17 @@ _TINY: Final = (
 )
 
 
-@rows(
-    _large(*_HUGE).row("huge_inertia", "A pendulum of 1 m swings from 1 rad for 1 s, ever heavier."),
-    _large(*_TINY).row(
-        "tiny_inertia", "A pendulum of 1 m swings from 1 rad for 1 s, ever lighter, down to subnormal numbers."
-    ),
-)
+@_large(*_TINY, "tiny_inertia", "A pendulum of 1 m swings from 1 rad for 1 s, ever lighter, down to subnormal numbers.")
+@_large(*_HUGE, "huge_inertia", "A pendulum of 1 m swings from 1 rad for 1 s, ever heavier.")
 def _of_inertia(inertia: float) -> Problem:
     # The motion does not depend on the mass, but all forces do.
     return _swing(catalog.pendulum(mass=inertia), 9.81, 0.0, 1.0, 16 * EPS)
 
 
-@rows(
-    _large(*_HUGE, measure="terms").row("huge_inertia_terms", "Terms of a double pendulum of 1 m each, ever heavier."),
-    _large(*_TINY, measure="terms").row(
-        "tiny_inertia_terms", "Terms of a double pendulum of 1 m each, ever lighter, down to subnormal numbers."
-    ),
+@_large(
+    *(*_TINY, "tiny_inertia_terms", "Terms of a double pendulum of 1 m each, ever lighter, down to subnormal numbers."),
+    measure="terms",
 )
+@_large(*_HUGE, "huge_inertia_terms", "Terms of a double pendulum of 1 m each, ever heavier.", measure="terms")
 def _terms_of_inertia(inertia: float) -> Problem:
     return terms_at(catalog.double_pendulum(mass1=inertia, mass2=inertia), force=inertia)

@@ -8,35 +8,32 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import EPS, Array
-from mbkit.model import Model, ModelBuilder
+from mbkit.model import ModelBuilder
 from mbkit.studies.measurement import Problem
-from mbkit.studies.stress.cases._common import Series, motion, powers
+from mbkit.studies.stress.cases._common import case, motion, powers
 
-_rubbed = partial(Series, "friction")
+_rubbed = partial(case, "friction")
+_ALONG: Final = (1.0, 0.0, 0.0)
 #: The pull of gravity on a block of 1 kg along its slope, N.
 _PULL: Final = 4.0
 
 
-def _block(friction: float) -> Model:
-    b = ModelBuilder("block", gravity=(-_PULL, 0.0, -9.0))
-    b.add_body("block", mass=1.0)
-    b.add_joint("x", "prismatic", parent="world", child="block", axis=(1.0, 0.0, 0.0), friction=friction)
-    return b.build()
-
-
 def _thrown(friction: float, speed: float) -> Problem:
     """Return a block that is thrown up a slope and rests where it stops, for twice that time."""
+    b = ModelBuilder("block", gravity=(-_PULL, 0.0, -9.0))
+    b.add_body("block", mass=1.0)
+    b.add_joint("x", "prismatic", parent="world", child="block", axis=_ALONG, friction=friction)
     slowed = _PULL + friction
     stops = speed / slowed
+    way = speed * stops / 2
 
     def exact(t: Array) -> Array:
         s = np.minimum(t, stops)
         return (s * (speed - slowed * s / 2))[:, None]
 
-    way = speed * stops / 2
     source = "Coulomb's law: uniformly slowed, and at rest"
     facts = {"friction over the other forces": friction / _PULL, "fastest change, 1/s": 1 / stops}
-    return motion(_block(friction), [0.0], speed, 2 * stops, exact, 4 * EPS * way, source, facts, scale=way)
+    return motion(b.build(), [0.0], speed, 2 * stops, exact, 4 * EPS * way, source, facts=facts, scale=way)
 
 
 @_rubbed("friction over pull", "", (1.1, 11.0, 110.0, 1100.0), (1.1, 110.0, 1100.0))
@@ -56,19 +53,19 @@ def many_at_rest(count: float) -> Problem:
     """A stack of blocks swings on a spring; friction just holds each block on the one below."""
     n, frequency, reach = int(count), 3.0, 0.5
     b = ModelBuilder("stack", gravity=np.zeros(3))
-    # Friction is a hundredth above the force that accelerates the blocks above a joint.
     for i in range(n + 1):
         b.add_body(f"block{i}", mass=1.0)
-        parent = f"block{i - 1}" if i else "world"
-        holds: dict[str, Any] = (
-            {"friction": 1.01 * (n + 1 - i) * reach * frequency**2} if i else {"stiffness": (n + 1) * frequency**2}
+        # Friction is a hundredth above the force that accelerates the blocks above a joint.
+        holds: dict[str, Any] = {"friction": 1.01 * (n + 1 - i) * reach * frequency**2}
+        holds = holds if i else {"stiffness": (n + 1) * frequency**2}
+        b.add_joint(
+            f"x{i}", "prismatic", parent=f"block{i - 1}" if i else "world", child=f"block{i}", axis=_ALONG, **holds
         )
-        b.add_joint(f"x{i}", "prismatic", parent=parent, child=f"block{i}", axis=(1.0, 0.0, 0.0), **holds)
     q = np.zeros(n + 1)
     q[0] = reach
 
     def exact(t: Array) -> Array:
         return np.cos(frequency * t)[:, None] * q
 
-    source = "a spring and the mass of all blocks"
-    return motion(b.build(), q, 0.0, 4.0, exact, 4 * EPS, source, {"joints with friction": count})
+    source, facts = "a spring and the mass of all blocks", {"joints with friction": count}
+    return motion(b.build(), q, 0.0, 4.0, exact, 4 * EPS, source, facts=facts)

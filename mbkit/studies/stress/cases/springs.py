@@ -14,11 +14,11 @@ from mbkit._check import EPS, Array
 from mbkit.model import Model, ModelBuilder
 from mbkit.studies.measurement import Problem
 from mbkit.studies.motions import exact as exact_motions
-from mbkit.studies.stress.cases._common import SWING, Facts, Series, motion, powers, rows
+from mbkit.studies.stress.cases._common import SWING, Facts, case, motion, powers
 
 _RANGE: Final = (powers(0, 12, 2), (1.0, 1e4, 1e8, 1e12))
-_joint = Series("stiffness", "stiffness", "N m/rad", *_RANGE)
-_point = Series("stiffness", "stiffness", "N/m", *_RANGE)
+_joint = partial(case, "stiffness", "stiffness", "N m/rad", *_RANGE)
+_point = partial(case, "stiffness", "stiffness", "N/m", *_RANGE)
 
 #: The error of slow motions by collocation, measured against Taylor series with 34 digits.
 _SLOW_FLOOR: Final = 1e-11
@@ -49,26 +49,21 @@ def _released_hinge(
     b.add_body("bob", mass=1.0, com=(0.0, 0.0, -1.0))
     b.add_joint("theta", "continuous", parent="world", child="bob", axis=SWING, stiffness=stiffness, damping=damping)
     exact, source = exact_motions.released(stiffness, damping / 2), "damped oscillator, Landau, Lifshitz 1976, §25"
-    return motion(b.build(), np.ones(1), 0.0, duration, exact, floor, source, facts, **more)
+    return motion(b.build(), np.ones(1), 0.0, duration, exact, floor, source, facts=facts, **more)
 
 
-@rows(
-    _joint.row(
-        "joint_spring",
-        "A body on a hinge with a spring rings for 1 s: every period of it has to be right.",
-        damping=0.0,
-    ),
-    _joint.row(
-        "lightly_damped_joint_spring",
-        "A body on a hinge rings for 1 s, in which a light damper takes a tenth of it.",
-        damping=0.2,
-    ),
-    _joint.row(
-        "critically_damped_joint_spring",
-        "A body on a hinge with a spring and critical damping comes to rest, the sooner the stiffer.",
-        damping=None,
-    ),
+# Of several decorators the last adds its case first.
+@_joint(
+    "critically_damped_joint_spring",
+    "A body on a hinge with a spring and critical damping comes to rest, the sooner the stiffer.",
+    damping=None,
 )
+@_joint(
+    "lightly_damped_joint_spring",
+    "A body on a hinge rings for 1 s, in which a light damper takes a tenth of it.",
+    damping=0.2,
+)
+@_joint("joint_spring", "A body on a hinge with a spring rings for 1 s: every period of it has to be right.", damping=0)
 def _joint_spring(stiffness: float, damping: float | None) -> Problem:
     """Return 1 s of the hinge; without a damping it is the critical one."""
     frequency = math.sqrt(stiffness)
@@ -83,15 +78,12 @@ def _slow(
     name, carried = force
     solved = exact_motions.slow_motion(F, np.array([1.0, carried, 0.0, 0.0]), duration, round(100 * duration))
     source = f"collocation in the angle and the spring's {name}, Radau IIA of order 15"
-
-    def exact(t: Array) -> Array:
-        return np.asarray(solved(t)[:, :2] / [1.0, stiffness])
-
-    q = np.array([1.0, carried / stiffness])
-    return motion(model, q, 0.0, duration, exact, _SLOW_FLOOR, source, facts)
+    scale = np.array([1.0, stiffness])
+    q = np.array([1.0, carried]) / scale
+    return motion(model, q, 0.0, duration, lambda t: solved(t)[:, :2] / scale, _SLOW_FLOOR, source, facts=facts)
 
 
-@_joint
+@_joint()
 def stiff_joint(stiffness: float) -> Problem:
     """A double pendulum falls from 1 rad with its second joint held straight by a spring and a damper."""
     # M22 - M12²/M11 at the straight pose, which is what the spring moves.
@@ -115,13 +107,11 @@ def stiff_joint(stiffness: float) -> Problem:
     return _slow(replace(model, joints=(first, held)), residual, torque, stiffness, 1.0, facts)
 
 
-@rows(
-    _point.row(
-        "point_spring",
-        "A mass circles on a point spring for 2 s and does not ring; the stiff direction turns with it.",
-        damped=False,
-    ),
-    _point.row("damped_point_spring", "A mass circles on a critically damped point spring for 2 s.", damped=True),
+@_point("damped_point_spring", "A mass circles on a critically damped point spring for 2 s.", damped=True)
+@_point(
+    "point_spring",
+    "A mass circles on a point spring for 2 s and does not ring; the stiff direction turns with it.",
+    damped=False,
 )
 def _conical(stiffness: float, damped: bool) -> Problem:
     """Return a mass that circles on a point spring of 1 m, without ringing, for 2 s.
@@ -147,17 +137,15 @@ def _conical(stiffness: float, damped: bool) -> Problem:
     # Rounding of the start alone makes the spring ring by as much.
     floor, facts = 64 * EPS * length, _facts(frequency, duration, damped=damped)
     source = "conical pendulum: the spring carries weight and centrifugal force"
-    return motion(b.build(), q, v, duration, circle, floor, source, facts, scale=radius)
+    return motion(b.build(), q, v, duration, circle, floor, source, facts=facts, scale=radius)
 
 
-@rows(
-    _point.row("elastic_pendulum", "An elastic pendulum swings from 1 rad for 2 s and hardly rings.", damped=False),
-    _point.row(
-        "damped_elastic_pendulum",
-        "An elastic pendulum with critical damping along its spring swings from 1 rad for 2 s.",
-        damped=True,
-    ),
+@_point(
+    "damped_elastic_pendulum",
+    "An elastic pendulum with critical damping along its spring swings from 1 rad for 2 s.",
+    damped=True,
 )
+@_point("elastic_pendulum", "An elastic pendulum swings from 1 rad for 2 s and hardly rings.", damped=False)
 def _elastic_pendulum(stiffness: float, damped: bool) -> Problem:
     """Return an elastic pendulum let go 1 rad from below, stretched as the weight alone would stretch it."""
     g, theta, duration = 1.0, 1.0, 2.0
@@ -178,7 +166,7 @@ def _elastic_pendulum(stiffness: float, damped: bool) -> Problem:
     return _slow(model, residual, ("force", g * math.cos(theta)), stiffness, duration, facts)
 
 
-@_point
+@_point()
 def ringing_elastic_pendulum(stiffness: float) -> Problem:
     """An elastic pendulum turns without gravity for 2 s; its spring rings with the same energy at any stiffness."""
     push, turn, duration = 0.3, 0.5, 2.0
@@ -188,12 +176,11 @@ def ringing_elastic_pendulum(stiffness: float) -> Problem:
     floor = 16 * EPS * (1 + frequency * duration) * push / math.sqrt(stiffness) + 1e-13
     facts = _facts(frequency, duration) | {"amplitude of the ringing, m": amplitude}
     model, q, v = catalog.elastic_pendulum(stiffness=stiffness, gravity=0.0), [0.0, radius - 1], [turn, push]
-    return motion(
-        model, q, v, duration, exact, floor, "central motion by quadrature, Landau, Lifshitz 1976, §14", facts
-    )
+    source = "central motion by quadrature, Landau, Lifshitz 1976, §14"
+    return motion(model, q, v, duration, exact, floor, source, facts=facts)
 
 
-@Series("stiffness", "damping", "N s/m", *_RANGE)
+@case("stiffness", "damping", "N s/m", *_RANGE)
 def stiff_damping(damping: float) -> Problem:
     """A cart on a soft spring pulls another one by a damper, for 2 s."""
     b, along = ModelBuilder("two_carts", gravity=(0.0, 0.0, 0.0)), (1.0, 0.0, 0.0)
@@ -204,10 +191,10 @@ def stiff_damping(damping: float) -> Problem:
     # q̈ = -M⁻¹ (K q + C q̇), M = [[2, 1], [1, 1]].
     rates = np.array([[0, 0, 1, 0], [0, 0, 0, 1], [-4, 0, 0, damping], [4, 0, 0, -2 * damping]])
     exact, facts = exact_motions.modal(rates, np.array([1.0, 0.0, 0.0, 0.0])), _facts(2 * damping, 2.0, damped=True)
-    return motion(b.build(), [1.0, 0.0], 0.0, 2.0, exact, 16 * EPS, "linear modes with 50 digits", facts)
+    return motion(b.build(), [1.0, 0.0], 0.0, 2.0, exact, 16 * EPS, "linear modes with 50 digits", facts=facts)
 
 
-@Series("stiffness", "cart mass", "kg", powers(0, -12, 2), (1.0, 1e-4, 1e-8, 1e-12))
+@case("stiffness", "cart mass", "kg", powers(0, -12, 2), (1.0, 1e-4, 1e-8, 1e-12))
 def light_cart_pole(cart: float) -> Problem:
     """A pole falls from the horizontal for 10 s; the lighter the cart, the shorter the jerk below."""
     theta = math.pi / 2
@@ -217,10 +204,10 @@ def light_cart_pole(cart: float) -> Problem:
     source = "energy and momentum with a quadrature, IFToMM proposal 'light cart-pole'"
     # The error was measured against 40 digits at the lightest cart.
     exact, floor = exact_motions.cart_pole(theta, cart), 2e-11
-    return motion(catalog.cart_pole(cart_mass=cart), [0.0, theta], 0.0, 10.0, exact, floor, source, facts)
+    return motion(catalog.cart_pole(cart_mass=cart), [0.0, theta], 0.0, 10.0, exact, floor, source, facts=facts)
 
 
-@Series("stiffness", "bending stiffness", "N m²", powers(5, 15, 2), (1e5, 1e9, 1e13))
+@case("stiffness", "bending stiffness", "N m²", powers(5, 15, 2), (1e5, 1e9, 1e13))
 def flexible_appendage(stiffness: float) -> Problem:
     """A hub swings slowly on a torsion spring and bends two beams that get stiffer and stiffer."""
     soft, angle, duration = 1000.0, 0.01, 2.0
@@ -237,7 +224,7 @@ def flexible_appendage(stiffness: float) -> Problem:
     floor = angle**3 * float(np.abs(shape[1:]).sum()) ** 2 + 16 * EPS
     facts = _facts(fastest, duration) | {"slowest frequency, rad/s": frequency}
     model, start = replace(model, joints=(hub, *model.joints[1:])), exact(np.zeros(1))[0]
-    return motion(model, start, 0.0, duration, exact, floor, "slowest linear mode", facts, scale=angle)
+    return motion(model, start, 0.0, duration, exact, floor, "slowest linear mode", facts=facts, scale=angle)
 
 
 def _antisymmetric_inertia(model: Model) -> Array:
@@ -294,34 +281,37 @@ _STEPS: Final = 200
 _AROUND: Final = (0.1, 1.0, 1.4, 1.7, 1.9, 2.1, 2.4, 2.7, 3.0, 4.0, 10.0, 100.0, 1000.0)
 _AROUND_CRITICAL: Final = (0.1, 0.4, 0.78, 0.88, 1.4, 2.0, 2.6, 3.0, 4.0, 4.6, 5.1, 10.0, 100.0, 1000.0)
 _AROUND_OVER: Final = (0.1, 1.0, 1.4, 1.85, 2.1, 2.4, 2.65, 3.0, 10.0, 50.0, 190.0, 215.0, 1000.0)
-#: ζ of the overdamped spring, and ω: its damper alone has the rate 1/s.
-_OVER, _SOFT = 5.0, 0.1
+#: ω and ζ of an overdamped spring: its damper alone has the rate 1/s.
+_OVER: Final = (0.1, 5.0)
 
 
-def _step(values: tuple[float, ...], quick: tuple[float, ...], frequency: float = 1.0, damping: float = 0.0) -> Series:
-    """Return what cases share whose linear theory is that of an oscillator with this ω and ζ."""
+def _step(
+    values: tuple[float, ...], quick: tuple[float, ...], oscillator: tuple[float, float], *named: str, **numbers: Any
+) -> Any:
+    """Return the decorator of a case whose linear theory is that of an oscillator with this ω and ζ."""
     why = "the test is for growth, not accuracy: a stable run stays near its start, an unstable one grows in each step"
-    more: dict[str, Any] = {"bar": 100.0, "why": why, "methods": _FIXED}
-    theory = partial(largest_step, frequency=frequency, damping=damping)
-    return Series("step", "step", "s", values, quick, theory=theory, **more)
+    theory = partial(largest_step, frequency=oscillator[0], damping=oscillator[1])
+    numbers |= {"bar": 100.0, "why": why, "methods": _FIXED, "theory": theory}
+    return case("step", "step", "s", values, quick, *named, **numbers)
 
 
-_OSCILLATOR: Final = _step(_AROUND, (1.0, 1.9, 2.1, 2.7, 3.0, 100.0))
-_CRITICAL: Final = _step(_AROUND_CRITICAL, (0.78, 0.88, 2.6, 3.0, 4.6, 5.1, 100.0), damping=1.0)
-_OVERDAMPED: Final = _step(_AROUND_OVER, (1.85, 2.1, 2.65, 3.0, 190.0, 215.0), frequency=_SOFT, damping=_OVER)
-
-
-@rows(
-    _OSCILLATOR.row("step_oscillator", "A body on a spring of 1 rad/s, 200 steps."),
-    _CRITICAL.row("step_critically_damped", "A body on a critically damped spring of 1 rad/s, 200 steps.", damping=1.0),
-    _OVERDAMPED.row(
-        "step_overdamped",
-        "A body on a spring with a strong damper, whose rates are 0.99 and 0.01 /s, 200 steps.",
-        frequency=_SOFT,
-        damping=_OVER,
-    ),
+@_step(
+    *(_AROUND_OVER, (1.85, 2.1, 2.65, 3.0, 190.0, 215.0), _OVER, "step_overdamped"),
+    "A body on a spring with a strong damper, whose rates are 0.99 and 0.01 /s, 200 steps.",
+    numbers=_OVER,
 )
-def _hinge_steps(step: float, frequency: float = 1.0, damping: float = 0.0) -> Problem:
+@_step(
+    *(_AROUND_CRITICAL, (0.78, 0.88, 2.6, 3.0, 4.6, 5.1, 100.0), (1.0, 1.0), "step_critically_damped"),
+    "A body on a critically damped spring of 1 rad/s, 200 steps.",
+    numbers=(1.0, 1.0),
+)
+@_step(
+    *(_AROUND, (1.0, 1.9, 2.1, 2.7, 3.0, 100.0), (1.0, 0.0), "step_oscillator"),
+    "A body on a spring of 1 rad/s, 200 steps.",
+    numbers=(1.0, 0.0),
+)
+def _hinge_steps(step: float, numbers: tuple[float, float]) -> Problem:
+    frequency, damping = numbers
     duration, facts = _STEPS * step, {"fastest frequency, rad/s": frequency}
     if damping:
         facts = {"fastest rate, 1/s": frequency * (damping + math.sqrt(damping**2 - 1))}
@@ -329,7 +319,7 @@ def _hinge_steps(step: float, frequency: float = 1.0, damping: float = 0.0) -> P
     return _released_hinge(frequency**2, 2 * damping * frequency, duration, floor, facts, dt=step)
 
 
-@_step(tuple(1e-3 * x for x in _AROUND[:-1]), tuple(1e-3 * x for x in (1.0, 1.9, 2.1, 2.7, 3.0, 10.0)), frequency=1e3)
+@_step(tuple(1e-3 * x for x in _AROUND[:-1]), tuple(1e-3 * x for x in (1.0, 1.9, 2.1, 2.7, 3.0, 10.0)), (1e3, 0.0))
 def step_point_spring(step: float) -> Problem:
     """A mass that circles on a point spring of 1000 rad/s, 200 steps."""
     facts = {"fastest frequency, rad/s": 1e3}
@@ -342,7 +332,7 @@ def step_point_spring(step: float) -> Problem:
 _STEP: Final = 4e-3
 
 
-@Series(
+@case(
     *("long", "steps", "", powers(3, 7), (1e3, 1e4, 1e5)),
     measure="energy",
     bar=1e-3,
@@ -353,8 +343,5 @@ _STEP: Final = 4e-3
 )
 def long_run(count: float) -> Problem:
     """A double pendulum, chaotic from (2, 1) rad at rest, for ever more steps of 4 ms."""
-    duration = count * _STEP
-    start = np.array([2.0, 1.0])
-    return Problem(
-        catalog.double_pendulum(), start, np.zeros(2), duration=duration, dt=_STEP, facts={"duration, s": duration}
-    )
+    model, start, duration = catalog.double_pendulum(), np.array([2.0, 1.0]), count * _STEP
+    return Problem(model, start, np.zeros(2), duration=duration, dt=_STEP, facts={"duration, s": duration})
