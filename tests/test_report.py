@@ -346,7 +346,7 @@ def test_a_run_that_is_the_fastest_for_several_errors_is_one_row():
     )
     (one,) = curves.leads(far)
     assert one.errors == pytest.approx([1e-2, 1e-4, 1e-6, 1e-8])
-    assert curves.next_engines(one) == "mujoco × 2"
+    assert one.next_engines == "mujoco × 2"
     rows = [line for line in printed(bench_table(far), 120).splitlines() if line.startswith("1e-")]
     assert [" ".join(r.split()[:3]) for r in rows] == ["1e-02 to 1e-08"]
     assert Tags(check_page(replace(AGREEING, precision=far))).text.count("1e-02 to 1e-08") == 1
@@ -483,7 +483,7 @@ def test_an_order_that_is_off_is_flagged_and_one_that_was_not_seen_is_not():
     assert "not the method's own" in text
     # The least error is the fastest of those that the reference can tell.
     line = curves.curve_lines(replace(STUDY, floor=1e-5))[0]
-    assert line.best is STUDY.curves[0].points[2]
+    assert line.point is STUDY.curves[0].points[2]
 
 
 def test_an_interrupted_study_and_one_of_nothing_say_so():

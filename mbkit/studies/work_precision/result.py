@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 
@@ -37,29 +37,29 @@ class Lead(NamedTuple):
     errors: list[float]
     nexts: list[tuple[Curve, Measurement] | None]
 
+    @property
+    def next_engines(self) -> str:
+        """The engines that are next, which may change with the error, and how many times as long they take."""
+        texts = []
+        for engine, alike in by_key((x[0].engine if x else "", x) for x in self.nexts).items():
+            factors = [x[1].seconds / self.point.seconds for x in alike if x]
+            ends = dict.fromkeys(count_text(x) for x in (min(factors), max(factors))) if factors else ()
+            texts.append(f"{engine} × {' to '.join(ends)}" if factors else "none")
+        return ", ".join(texts)
+
+
+class CurveLine(NamedTuple):
+    """One curve: the fastest point of the least error that the reference can resolve, and marks."""
+
+    curve: Curve
+    point: Measurement | None
+    off: bool  # the observed order is not the method's own
+    on_front: bool
+
 
 def _range(errors: Sequence[float]) -> str:
     """Return the largest and the least of some errors."""
     return " to ".join(dict.fromkeys(f"{x:.0e}" for x in (errors[0], errors[-1])))
-
-
-def next_engines(lead: Lead) -> str:
-    """Return the engines that are next, which may change with the error, and how many times as long they take."""
-    texts = []
-    for engine, alike in by_key((x[0].engine if x else "", x) for x in lead.nexts).items():
-        factors = [x[1].seconds / lead.point.seconds for x in alike if x]
-        ends = dict.fromkeys(count_text(x) for x in (min(factors), max(factors))) if factors else ()
-        texts.append(f"{engine} × {' to '.join(ends)}" if factors else "none")
-    return ", ".join(texts)
-
-
-class CurveLine(NamedTuple):
-    """One engine and method in one line."""
-
-    curve: Curve
-    best: Measurement | None  # the fastest of those with the least error that the reference can resolve
-    off: bool  # the observed order is not the method's own
-    on_front: bool
 
 
 @dataclass(frozen=True)
@@ -113,13 +113,10 @@ class WorkPrecision(ResultTable):
     @property
     def failed(self) -> tuple[Refusal, ...]:
         """Engines and methods that gave no error at all, with the reason."""
-        empty = [c for c in self.curves if not any(math.isfinite(p.error) for p in c.points)]
-        why = [next((p.note for p in c.points if p.note), c.ended or "no run came to an end") for c in empty]
-        mute = [Refusal(c.engine, c.method, reason) for c, reason in zip(empty, why, strict=True)]
-        return (
-            *self.refusals,
-            *(r for r in mute if (r.engine, r.term) not in {(x.engine, x.term) for x in self.refusals}),
-        )
+        refused = {(r.engine, r.term) for r in self.refusals}
+        mute = [line.curve for line in curve_lines(self) if line.point is None]
+        rest = (Refusal(c.engine, c.method, _why_none(c)) for c in mute if (c.engine, c.method) not in refused)
+        return (*self.refusals, *rest)
 
     @property
     def untimed(self) -> tuple[str, ...]:
@@ -145,21 +142,21 @@ class WorkPrecision(ResultTable):
     @property
     def shortened(self) -> tuple[str, ...]:
         """What was taken out of the model, curves that failed or ran out of time, and a horizon that was cut."""
-        out = [*self.settings.get("changed", ()), *([] if self.complete else ["interrupted"])]
-        if failed := self.failed:
-            names = list(dict.fromkeys(r.name for r in failed))
-            out.append(f"{counted(len(names), 'curve')} left out: {', '.join(names)}")
-        out += [self.bounded] if self.bounded else []
+        failed = {(r.engine, r.term): r.name for r in self.failed}
         ended = [f"{c.engine} {c.method}" for c in self.curves if c.ended]
-        if ended:
-            out.append(f"{counted(len(ended), 'curve')} ended by time: {', '.join(ended)}")
-        none = {(r.engine, r.term) for r in self.failed}
-        lost = sum(math.isnan(p.seconds) for c, p in self.rows() if (c.engine, c.method) not in none)
-        if lost:
-            out.append(f"{counted(lost, 'setting')} not run")
-        if self.duration < self.asked * (1 - 1e-9):
-            out.append(f"horizon cut from {self.asked:g} s to {self.duration:g} s")
-        return tuple(out)
+        lost = sum(math.isnan(p.seconds) for c, p in self.rows() if (c.engine, c.method) not in failed)
+        cut = self.duration < self.asked * (1 - 1e-9)
+        names = list(dict.fromkeys(failed.values()))
+        out = [
+            *self.settings.get("changed", ()),
+            "" if self.complete else "interrupted",
+            f"{counted(len(names), 'curve')} left out: {', '.join(names)}" if names else "",
+            self.bounded,
+            f"{counted(len(ended), 'curve')} ended by time: {', '.join(ended)}" if ended else "",
+            f"{counted(lost, 'setting')} not run" if lost else "",
+            f"horizon cut from {self.asked:g} s to {self.duration:g} s" if cut else "",
+        ]
+        return tuple(filter(None, out))
 
     @property
     def front(self) -> tuple[tuple[Curve, Measurement], ...]:
@@ -206,11 +203,11 @@ class WorkPrecision(ResultTable):
         parts = [f"{name} for an error of {_range([e for lead in some for e in lead.errors])}" for name, some in groups]
         if not parts:
             return f"{stopped}no run has an error of at most {10.0 ** _ERROR_EXPONENTS[0]:g} rad or m"
-        count = f"{len(self.curves)} curve{'s' * (len(self.curves) != 1)}"
+        what, count = "fastest of {}", counted(len(self.curves), "curve")
         if self.untimed:
             stopped += f"no time was left for {' and '.join(self.untimed)}, so none is the fastest; "
-            return f"{stopped}of {count}, least time: {', '.join(parts)}"
-        return f"{stopped}fastest of {count}: {', '.join(parts)}"
+            what = "of {}, least time"
+        return f"{stopped}{what.format(count)}: {', '.join(parts)}"
 
     def document(self, target: str = "") -> doc.Document:
         """Return the document of the study; `target` is the name by which a person called the model."""
@@ -276,6 +273,11 @@ def curve_lines(result: WorkPrecision) -> list[CurveLine]:
     return out
 
 
+def _why_none(curve: Curve) -> str:
+    """Return why a curve has no error at all."""
+    return next((p.note for p in curve.points if p.note), curve.ended or "no run came to an end")
+
+
 def front_names(result: WorkPrecision) -> list[str]:
     """Return the names of the curves on the front, the fastest first; no answers are left out."""
     return list(dict.fromkeys(c.name for c, p in result.front if p.error <= MAX_USEFUL_ERROR))
@@ -304,126 +306,40 @@ def curve_sections(result: WorkPrecision, whole: bool, on: doc.On = "both") -> l
     """Return the sections of a study, shown on `on`; unless `whole`, a terminal shows the fastest only."""
     missing = missing_text(result.shortened).removeprefix("; ") if not whole else ""
     cut = f", cut from {result.asked:g} s where the reference stops holding" if result.duration < result.asked else ""
-    of = "rad or m (a smaller error of a run cannot be told)"
-    known = (
-        f"its own error is at most {error_text(result.floor)} {of}"
-        if math.isfinite(result.floor)
-        else "its own error is unknown"
+    known = "its own error is unknown"
+    if math.isfinite(result.floor):
+        floor = error_text(result.floor)
+        known = f"its own error is at most {floor} rad or m (a smaller error of a run cannot be told)"
+    front = (
+        f"Lower left is better. On the front, fastest first: {', '.join(front_names(result))}. Names at the lower left "
+        "are the methods of the front, in their engine’s colour. Run times are without deriving and compiling, first "
+        "runs with both."
     )
-    front = "Lower left is better. On the front, fastest first: {}. Names beside the grey band are the methods that "
-    front += (
-        "join it there, in their engine’s colour. Run times are without deriving and compiling, first runs with both."
-    )
-    drawn = doc.Figure(lambda: error_against_time(result), front.format(", ".join(front_names(result))), wide=True)
-    fastest = leads(result)
-    about = f"Error against run time, {result.duration:g} s of motion: errors of q in rad or m"
+    fastest, lines = leads(result), curve_lines(result)
     start = [(n, f"{n} = [{setting_words(getattr(result, n))}]") for n in ("q0", "v0")]
-    lists: doc.On = on if whole else "page"
-    return [
-        doc.Section(
-            about,
-            [
-                *([doc.Paragraph(doc.Span(f"! {missing}", "allowed"))] if missing else []),
-                doc.Paragraph(
-                    f"Errors are the largest difference of q on the manifold over the saved times{cut}.", "page"
-                ),
-                doc.Paragraph(f"Reference: {result.reference}; {known}."),
-                *([drawn] if result.front else []),
-            ],
-            on,
-        ),
-        doc.Section(
-            "Who reaches an error first",
-            [doc.Table(_LEADS, fastest) if fastest else doc.Paragraph(doc.Span("no run reached 1e-02", "muted"))],
-            on,
-            level=3,
-        ),
-        doc.Section(
-            "Engine by engine, method by method; the run time is that of the least error",
-            _curve_blocks(result),
-            lists,
-            level=3,
-        ),
-        doc.Section("What could not be measured", [doc.Items(failed_curves(result.failed))], on, level=3),
-        doc.Section("Where rounding grows", [doc.Items([doc.Bullet("", x) for x in result.turns])], on, level=3),
-        doc.Section("", [doc.Details("the motion", [doc.Facts(start)])], on="page", level=3),
+    about: list[doc.Block] = [
+        *([doc.Paragraph(doc.Span(f"! {missing}", "allowed"))] if missing else []),
+        doc.Paragraph(f"Errors are the largest difference of q on the manifold over the saved times{cut}.", "page"),
+        doc.Paragraph(f"Reference: {result.reference}; {known}."),
+        *([doc.Figure(lambda: error_against_time(result), front, wide=True)] if result.front else []),
     ]
+    none = doc.Paragraph(doc.Span("no run reached 1e-02", "muted"))
+    sections: list[tuple[str, list[doc.Block], doc.On]] = [
+        ("Who reaches an error first", [doc.Table(_LEADS, fastest) if fastest else none], on),
+        (
+            "Engine by engine, method by method; the run time is that of the least error",
+            _curve_blocks(result, lines) if lines else [],
+            on if whole else "page",
+        ),
+        ("What could not be measured", [doc.Items(failed_curves(result.failed))], on),
+        ("Where rounding grows", [doc.Items([doc.Bullet("", x) for x in result.turns])], on),
+        ("", [doc.Details("the motion", [doc.Facts(start)])], "page"),
+    ]
+    title = f"Error against run time, {result.duration:g} s of motion: errors of q in rad or m"
+    return [doc.Section(title, about, on), *(doc.Section(*section, level=3) for section in sections)]
 
 
-def setting_text(point: Measurement) -> str:
-    """Return the step with its unit, or the tolerance."""
-    return f"dt {time_text(point.value)}" if point.setting == "dt" else f"rtol {point.value:.0e}"
-
-
-def _known(x: float) -> str:
-    return "" if math.isnan(x) else error_text(x)
-
-
-_LEADS: Final = (
-    doc.Column("error ≤", lambda x: _range(x.errors), right=True),
-    doc.Column("engine", lambda x: x.curve.engine),
-    doc.Column("method", lambda x: x.curve.method),
-    doc.Column("setting", lambda x: setting_text(x.point), right=True),
-    doc.Column("run time", lambda x: time_text(x.point.seconds), right=True),
-    doc.Column("±", lambda x: doc.Span(time_text(x.point.spread), "muted"), right=True, on="page"),
-    doc.Column("first run", lambda x: time_text(x.curve.compile + x.point.seconds) or "–", right=True),
-    doc.Column("next engine", lambda x: doc.Span(next_engines(x), "muted")),
-    doc.Column("its method", lambda x: ", ".join(dict.fromkeys(n[0].method for n in x.nexts if n)), on="page"),
-)
-
-
-def _order(line: CurveLine) -> doc.Text:
-    order = "" if math.isnan(line.curve.order) else f"{line.curve.order:.2f}"
-    return doc.Span(f"! {order}", "allowed") if line.off else order
-
-
-_CURVES: Final = (
-    doc.Column("", lambda x: doc.Span("●" if x.on_front else "", "good")),
-    doc.Column("engine", lambda x: x.curve.engine),
-    doc.Column("method", lambda x: x.curve.method),
-    doc.Column("order", _order, right=True),
-    doc.Column("of", lambda x: "" if math.isnan(x.curve.expected) else f"{x.curve.expected:g}", right=True),
-    doc.Column("from\npoints", lambda x: doc.Span(str(x.curve.order_points or ""), "muted"), right=True, on="page"),
-    doc.Column("least error", lambda x: error_text(x.best.error) if x.best else "none", right=True),
-    doc.Column("at", lambda x: setting_text(x.best) if x.best else "", right=True, on="page"),
-    doc.Column("run time", lambda x: time_text(x.best.seconds) if x.best else "", right=True),
-    doc.Column("±", lambda x: doc.Span(time_text(x.best.spread) if x.best else "", "muted"), right=True, on="page"),
-    doc.Column("energy\ndrift", lambda x: _known(x.best.energy) if x.best else "", right=True, on="page"),
-    doc.Column("compile", lambda x: time_text(x.curve.compile) or "–", right=True),
-    doc.Column(
-        "first run",
-        lambda x: (time_text(x.curve.compile + x.best.seconds) or "–") if x.best else "",
-        right=True,
-        on="page",
-    ),
-    doc.Column("note", lambda x: doc.Span(_why_none(x), "muted"), on="page"),
-)
-
-
-def _why_none(line: CurveLine) -> str:
-    """Return why a curve has no error at all."""
-    return "" if line.best else next((p.note for p in line.curve.points if p.note), "no run came to an end")
-
-
-_POINTS: Final = (
-    doc.Column("engine", lambda x: x[0].engine),
-    doc.Column("method", lambda x: x[0].method),
-    doc.Column("setting", lambda x: setting_text(x[1]), right=True),
-    doc.Column("error of q,\nrad or m", lambda x: _known(x[1].error) or "–", right=True),
-    doc.Column("energy\ndrift", lambda x: _known(x[1].energy), right=True),
-    doc.Column("run time", lambda x: time_text(x[1].seconds), right=True),
-    doc.Column("±", lambda x: doc.Span(time_text(x[1].spread), "muted"), right=True),
-    doc.Column("first run", lambda x: time_text(x[0].compile + x[1].seconds), right=True),
-    doc.Column("steps", lambda x: str(x[1].steps or ""), right=True),
-    doc.Column("evaluations", lambda x: str(x[1].evaluations or ""), right=True),
-    doc.Column("note", lambda x: doc.Span(x[1].note, "muted")),
-)
-
-
-def _curve_blocks(result: WorkPrecision) -> list[doc.Block]:
-    lines = curve_lines(result)
-    if not lines:
-        return []
+def _curve_blocks(result: WorkPrecision, lines: Sequence[CurveLine]) -> list[doc.Block]:
     counts = [p.repeats for _, p in result.rows() if p.repeats]
     repeats = " to ".join(dict.fromkeys(str(x) for x in (min(counts, default=0), max(counts, default=0))))
     work, timing = result.settings.get("work"), result.settings.get("timing")
@@ -443,5 +359,72 @@ def _curve_blocks(result: WorkPrecision) -> list[doc.Block]:
             on="page",
             note=True,
         ),
-        doc.Details("every setting", [doc.Table(_POINTS, list(result.rows()))]),
+        doc.Details("every setting", [doc.Table(_POINTS, [CurveLine(c, p, False, False) for c, p in result.rows()])]),
     ]
+
+
+# Columns of rows that have a curve and a point, which may be None.
+
+
+def setting_text(point: Measurement) -> str:
+    """Return the step with its unit, or the tolerance."""
+    return f"dt {time_text(point.value)}" if point.setting == "dt" else f"rtol {point.value:.0e}"
+
+
+def _column(head: str, text: Callable[[Measurement], str], *, muted: bool = False, **more: Any) -> doc.Column:
+    """Return a column of points, empty where there is none."""
+
+    def cell(row: Any) -> doc.Text:
+        shown = "" if row.point is None else text(row.point)
+        return doc.Span(shown, "muted") if muted else shown
+
+    return doc.Column(head, cell, right=True, **more)
+
+
+def _number(x: float) -> str:
+    return "" if math.isnan(x) else error_text(x)
+
+
+def _first_run(row: Any) -> str:
+    return "" if row.point is None else time_text(row.curve.compile + row.point.seconds) or "–"
+
+
+def _order(line: CurveLine) -> doc.Text:
+    order = "" if math.isnan(line.curve.order) else f"{line.curve.order:.2f}"
+    return doc.Span(f"! {order}", "allowed") if line.off else order
+
+
+_NAME: Final = (doc.Column("engine", lambda x: x.curve.engine), doc.Column("method", lambda x: x.curve.method))
+_SETTING: Final = _column("setting", setting_text)
+_TIMES: Final = (
+    _column("run time", lambda p: time_text(p.seconds)),
+    _column("±", lambda p: time_text(p.spread), muted=True, on="page"),
+)
+_ENERGY: Final = _column("energy\ndrift", lambda p: _number(p.energy), on="page")
+_FIRST_RUN: Final = doc.Column("first run", _first_run, right=True)
+_LEADS: Final = (
+    doc.Column("error ≤", lambda x: _range(x.errors), right=True),
+    *(*_NAME, _SETTING, *_TIMES, _FIRST_RUN),
+    doc.Column("next engine", lambda x: doc.Span(x.next_engines, "muted")),
+    doc.Column("its method", lambda x: ", ".join(dict.fromkeys(n[0].method for n in x.nexts if n)), on="page"),
+)
+_CURVES: Final = (
+    doc.Column("", lambda x: doc.Span("●" if x.on_front else "", "good")),
+    *_NAME,
+    doc.Column("order", _order, right=True),
+    doc.Column("of", lambda x: "" if math.isnan(x.curve.expected) else f"{x.curve.expected:g}", right=True),
+    doc.Column("from\npoints", lambda x: doc.Span(str(x.curve.order_points or ""), "muted"), right=True, on="page"),
+    doc.Column("least error", lambda x: error_text(x.point.error) if x.point else "none", right=True),
+    *(replace(_SETTING, head="at", on="page"), *_TIMES, _ENERGY),
+    doc.Column("compile", lambda x: time_text(x.curve.compile) or "–", right=True),
+    replace(_FIRST_RUN, on="page"),
+    doc.Column("note", lambda x: doc.Span("" if x.point else _why_none(x.curve), "muted"), on="page"),
+)
+_POINTS: Final = (
+    *(*_NAME, _SETTING),
+    _column("error of q,\nrad or m", lambda p: _number(p.error) or "–"),
+    *(_ENERGY, *_TIMES, _FIRST_RUN),
+    _column("steps", lambda p: str(p.steps or "")),
+    _column("evaluations", lambda p: str(p.evaluations or "")),
+    doc.Column("note", lambda x: doc.Span(x.point.note, "muted")),
+)
