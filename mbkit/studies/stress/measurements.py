@@ -137,7 +137,7 @@ class CaseResult:
 
     @cached_property
     def lines(self) -> list[Line]:
-        """The rows, the furthest first: by what held, by what was usable, by run time."""
+        """The rows in the order of what held, then of what was usable, then of run time."""
 
         def rank(line: Line) -> tuple[float, ...]:
             seconds = math.inf if math.isnan(line.seconds) else line.seconds
@@ -147,7 +147,7 @@ class CaseResult:
 
     @cached_property
     def best(self) -> dict[str, Line]:
-        """The line that speaks for each engine: its furthest method, or of the terms that it has the first to break."""
+        """The furthest method of each engine; of terms that it has, the first to break."""
         ranked = self.lines
         if self.measure == "terms":
             ranked = sorted(ranked, key=lambda line: (line.left_out, line.reach, line.usable))

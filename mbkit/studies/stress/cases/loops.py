@@ -24,7 +24,8 @@ from mbkit.studies.stress.cases._common import case, motion, powers
 #: Crank, coupler and rocker of the four-bar that is cut down to a change point, m.
 _CRANK, _COUPLER, _ROCKER = 0.3, 0.9, 0.7
 _near = partial(
-    *(case, "near-singular", "distance", "m", powers(-1, -7), (1e-1, 1e-3, 1e-5)),
+    case,
+    *("near-singular", "distance", "m", powers(-1, -7), (1e-1, 1e-3, 1e-5)),
     measure="energy",
     bar=1e-6,
     why="what a run loses where rows nearly depend on each other shows in its energy",
@@ -89,7 +90,8 @@ def heavy_bricard(ratio: float) -> Problem:
 _Y, _Z = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 #: At the last values rows count as equal: one more freedom is left, as the facts say, and the motion is that of 0.
 _redundant = partial(
-    *(case, "near-singular", "apart", "", (*powers(-1, -10, 3), 1e-11, 1e-12), (1e-1, 1e-4, 1e-7)),
+    case,
+    *("near-singular", "apart", "", (*powers(-1, -10, 3), 1e-11, 1e-12), (1e-1, 1e-4, 1e-7)),
     measure="terms",
     bar=1e3 * EPS,
     why="accelerations lose digits with the condition of the rows in the metric of the mass matrix, which divides them",

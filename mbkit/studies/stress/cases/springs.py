@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, Final
@@ -14,7 +15,7 @@ from mbkit._check import EPS, Array
 from mbkit.model import Model, ModelBuilder
 from mbkit.studies.measurement import Problem
 from mbkit.studies.motions import exact as exact_motions
-from mbkit.studies.stress.cases._common import SWING, Facts, case, motion, powers
+from mbkit.studies.stress.cases._common import SWING, Facts, Make, case, motion, powers
 
 _RANGE: Final = (powers(0, 12, 2), (1.0, 1e4, 1e8, 1e12))
 _joint = partial(case, "stiffness", "stiffness", "N m/rad", *_RANGE)
@@ -287,7 +288,7 @@ _OVER: Final = (0.1, 5.0)
 
 def _step(
     values: tuple[float, ...], quick: tuple[float, ...], oscillator: tuple[float, float], *named: str, **numbers: Any
-) -> Any:
+) -> Callable[[Make], Make]:
     """Return the decorator of a case whose linear theory is that of an oscillator with this ω and ζ."""
     why = "the test is for growth, not accuracy: a stable run stays near its start, an unstable one grows in each step"
     theory = partial(largest_step, frequency=oscillator[0], damping=oscillator[1])
