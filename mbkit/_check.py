@@ -19,6 +19,19 @@ K = TypeVar("K")
 V = TypeVar("V")
 #: Distance from 1 to the next double.
 EPS: Final = float(np.finfo(float).eps)
+# Tolerances by what leaves them; a decision that needs another one says why where it is made.
+#: Part of a number that sums and solutions lose to rounding.
+ROUNDING: Final = 1e-12
+#: The same of iterations, and of formulas of some thousand operations.
+ITERATED: Final = 1e-11
+#: Part of a number, or of the largest one beside it, that a typed number with its few digits misses.
+TYPED: Final = 1e-9
+#: Residual of a consistent state beside each row's scale: rounding and a few typed digits.
+CONSISTENT: Final = 1e-8
+#: Part of a number that a file with six digits leaves open.
+PRINTED: Final = 1e-6
+#: Larger than anything that moves, and the products of several still fit a double.
+MAX_MAGNITUDE: Final = 1e30
 _MAX_SUMMED: Final = 64
 #: Numbers of a piece of an array that is checked and copied in pieces.
 _PIECE_SIZE: Final = 2**16

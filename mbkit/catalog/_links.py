@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
+from mbkit._check import ROUNDING
 from mbkit.errors import InputError
 from mbkit.model import ModelBuilder, Number, known, nominal
 
@@ -19,8 +20,6 @@ Z: Final = (0.0, 0.0, 1.0)
 ORIGIN: Final[Pair] = (0.0, 0.0)
 #: Cosine and sine of three directions in a plane, 120° apart.
 THIRDS: Final = ((1.0, 0.0), (-0.5, 0.75**0.5), (-0.5, -(0.75**0.5)))
-#: Height of a triangle over one of its sides, squared, below which rounding alone keeps its corners apart.
-_FLAT_TRIANGLE_RATIO: Final = 1e-12
 
 
 def at(point: Pair) -> Point:
@@ -67,7 +66,7 @@ def add_pin(b: ModelBuilder, name: str, body_a: str, end_a: Pair, body_b: str, e
 def leg(names: str, side: Number, other: Number) -> Number:
     """Return the second leg of a right triangle with a hypotenuse and a leg; `names` are for the message."""
     square = side**2 - other**2
-    if known(square) and nominal(square) <= _FLAT_TRIANGLE_RATIO * nominal(side) ** 2:
+    if known(square) and nominal(square) <= ROUNDING * nominal(side) ** 2:
         a, b = (abs(nominal(x)) for x in (side, other))
         raise InputError(
             f"{names}: expected links that meet at an angle, got a reach of {a:g} m for {b:g} m; change one"

@@ -61,8 +61,6 @@ _MAX_AXES: Final = 4
 #: Entries of a Python float, and of one that must be positive.
 FLOAT, POSITIVE = -1, -2
 _METH_FASTCALL: Final = 0x80
-# PyArray_Type and PyArray_New in the table of NumPy's C API, the same since NumPy 1.0; NPY_DOUBLE.
-_API_TYPE, _API_NEW, _NPY_DOUBLE = 2, 93, 12
 _I32, _I64, _F64, _PTR = ir.IntType(32), ir.IntType(64), ir.DoubleType(), ir.PointerType()
 
 
@@ -157,7 +155,7 @@ def _process() -> tuple[int, ...]:
     python = ("PyFloat_FromDouble", "PyTuple_New", "PyTuple_SetItem")
     memory = (_address(name) for name in ("PyMem_RawMalloc", "PyMem_RawFree"))
     counts = (_address(name) for name in ("Py_IncRef", "Py_DecRef"))
-    return *heads, *memory, id(None), *counts, _api(_API_NEW), *map(_address, python)
+    return *heads, *memory, id(None), *counts, _api(93), *map(_address, python)
 
 
 def _address(name: str) -> int:
@@ -181,7 +179,8 @@ def _layout_is_known() -> bool:
     """Return whether NumPy's objects are as this file reads them."""
     x = np.arange(6.0)[::2]
     try:
-        array_type = _api(_API_TYPE)
+        # PyArray_Type in the table of NumPy's C API, the same since NumPy 1.0, as PyArray_New is.
+        array_type = _api(2)
     except (AttributeError, ValueError):
         return False
     words = [_word(id(x), i) for i in range(_DTYPE + 1)]
@@ -195,7 +194,6 @@ def _layout_is_known() -> bool:
         and _word(words[_DTYPE], _KIND) >> 32 == x.dtype.num
         and _word(id(1.0), _HEAD) == int(np.float64(1.0).view(np.int64))
         and array_type == id(np.ndarray)
-        and np.dtype(np.float64).num == _NPY_DOUBLE
     )
 
 
@@ -326,7 +324,16 @@ def _code() -> str:
                 require(is_there(b.load(value, typ=_PTR)), no_memory)
             with is_array:
                 kind, shape = b.inttoptr(number(_ARRAY), _PTR), b.at(result, _I64(3), _I64)
-                arguments = (b.trunc(axes, _I32), shape, _I32(_NPY_DOUBLE), nothing, nothing, _I32(0), _I32(0), nothing)
+                arguments = (
+                    b.trunc(axes, _I32),
+                    shape,
+                    _I32(np.dtype(np.float64).num),
+                    nothing,
+                    nothing,
+                    _I32(0),
+                    _I32(0),
+                    nothing,
+                )
                 array = call(number(_NEW_ARRAY), _PTR, kind, *arguments)
                 b.store(array, value)
                 require(is_there(array), no_memory)

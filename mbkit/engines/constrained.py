@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, batch_of
+from mbkit._check import CONSISTENT, ROUNDING, Array, batch_of
 from mbkit._imports import from_above
 from mbkit._reproducible import dependent, unit_rows
 from mbkit._warn import warn
@@ -17,13 +17,6 @@ from mbkit.engines.evaluation import Evaluation
 from mbkit.errors import InputError, MbkitWarning, NumericalError
 from mbkit.model.elements.paths import ALL, Path
 
-if TYPE_CHECKING:
-    pass
-
-#: Residual of a consistent state beside each row's scale: rounding and a few typed digits.
-CONSISTENT: Final = 1e-8
-#: Part of accelerations that sums and a solution lose to rounding.
-ROUNDING: Final = 1e-12
 #: Least entry, in the unit vector of the smallest singular value, of a row that depends on others.
 TAKES_PART: Final = 0.1
 ASKED: Final = frozenset({"row", "speed"}), "it has no loops and no other constraints (add_loop, or constraints=[...])"

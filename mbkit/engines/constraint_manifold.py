@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._attributes import forwarded
-from mbkit._check import EPS, Array
+from mbkit._check import CONSISTENT, EPS, ROUNDING, Array
 from mbkit._reproducible import dependent, independent_rows, pivoted, singular_values, under_rows, unit_rows
 from mbkit.derivation.constraints import starts
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, projection
 from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.engines.base import Dynamics, at_time
-from mbkit.engines.constrained import CONSISTENT, ROWS, singular_pose
+from mbkit.engines.constrained import ROWS, singular_pose
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Model
@@ -263,7 +263,7 @@ class Manifold:
             terms = self._terms(x, v)
             step[free] = under_rows(M, terms.held[:, free], M @ model.difference(x, q)[free], -terms.f)[0]
             size = float(np.linalg.norm(step))
-            if size <= 1e-12 * (1 + float(np.linalg.norm(x))):
+            if size <= ROUNDING * (1 + float(np.linalg.norm(x))):
                 break
             # Where the constraints bend strongly, whole steps go to and fro about the foot.
             length = min(1.0, 1.1 * length) if size < last else 0.5 * length

@@ -14,7 +14,7 @@ from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
-from mbkit._check import Array, finite_array
+from mbkit._check import MAX_MAGNITUDE, Array, finite_array
 from mbkit.errors import LoadError, ModelError, UnsupportedError
 from mbkit.load.xml_reader import Element, Reader, reserved
 from mbkit.model import Body, Coupler, Joint, Loop, Model, ModelBuilder
@@ -40,17 +40,14 @@ IMPORTERS = {
 }
 #: Whose importer reads SDF.
 _OF_SDF: Final = "drake"
-_POSE_SIZE: Final = 6
 #: How many numbers elements of SDF hold; sdformat takes the first of more, and a default for none. A pose may be empty.
-_IN_SDF: Final = {"pose": _POSE_SIZE, "xyz": 3} | dict.fromkeys(
+_IN_SDF: Final = {"pose": 6, "xyz": 3} | dict.fromkeys(
     (
         *("mass", "ixx", "iyy", "izz", "ixy", "ixz", "iyz", "damping", "spring_stiffness", "spring_reference"),
         *("thread_pitch", "screw_thread_pitch"),
     ),
     1,
 )
-#: The largest number that mbkit's own loaders take.
-_MAX_NUMBER: Final = 1e30
 
 
 class Beside(NamedTuple):
@@ -119,7 +116,7 @@ def checked(engine: str, model: Model) -> Model:
     for part in (*model.bodies, *model.joints, model):
         for name, rule, value in numbers(part):
             # Not a number, or memory that nobody wrote to.
-            if rule.acts and not (np.abs(value) <= _MAX_NUMBER).all():
+            if rule.acts and not (np.abs(value) <= MAX_MAGNITUDE).all():
                 where = "" if part is model else f"{type(part).__name__.lower()} {part.name!r} with "
                 raise UnsupportedError(f"{engine}: built {where}an impossible {name}: {value}")
     return model
@@ -149,7 +146,7 @@ def model_of_sdf(
         raise LoadError(f"{path}: expected an SDF of one <model> and nothing beside it, got {there}")
     numbers = Reader()
     for element in models[0].walk():
-        if (n := _IN_SDF.get(element.tag)) and (element.text or n != _POSE_SIZE):
+        if (n := _IN_SDF.get(element.tag)) and (element.text or n != 6):
             n += element.attributes.get("rotation_format") == "quat_xyzw"
             numbers.numbers(replace(element, attributes={"text": element.text}), "text", "model", count=n)
     if numbers.faults:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,9 +31,6 @@ from mbkit.methods.small_motions import graded
 from mbkit.model import Model
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.quantities import QUANTITIES, of_groups
-
-if TYPE_CHECKING:
-    pass
 
 LINEARIZE: Final = Path("linearize", "linearize: not known of", ALL)
 #: Quantities that `parameter_derivatives` differentiates.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,9 +10,6 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array
 from mbkit.engines.evaluation import Evaluation
 from mbkit.model.base_parameters import PARAMETER_SETS, RegressorColumns, regressor_columns
-
-if TYPE_CHECKING:
-    pass
 
 _STANDARD: Final = PARAMETER_SETS[0]
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import EPS, Array, batch_of, real, real_array, require_finite
+from mbkit._check import EPS, ITERATED, Array, batch_of, real, real_array, require_finite
 from mbkit._imports import from_above
 from mbkit.engines.constrained import unwatched
 from mbkit.engines.evaluation import Evaluation
@@ -42,10 +42,8 @@ STEP_DERIVATIVE: Final = Path(
     also=lambda model: () if model.velocity_map is None else ("it has quasi-velocities of its own",),
     instead="linearize(q, v, tau).discretize(dt) holds the linear system's force",
 )
-#: Newton's iterations for the stages of an implicit method, and the part of the numbers' size below which corrections
-#: that stop shrinking are rounding.
-_MAX_NEWTON_ITERATIONS: Final = 25
-_STALLED_CORRECTION: Final = 1e-11
+#: Newton's iterations for what a step solves.
+MAX_NEWTON_ITERATIONS: Final = 25
 
 
 class Steps(Evaluation):
@@ -394,7 +392,7 @@ def _implicit_step(tableau: ImplicitTableau, space: DualSpace, rates: _Rates, h:
     k = np.zeros((s, size, 2 * n))
     k[..., :n] = w.value
     last = np.full(size, np.inf)
-    for _ in range(_MAX_NEWTON_ITERATIONS):
+    for _ in range(MAX_NEWTON_ITERATIONS):
         stages = h * np.einsum("ij,jbm->ibm", A, k)
         J, by_x, miss = np.empty((s, size, 2 * n, 2 * n)), np.empty((s, size, 2 * n, columns)), np.empty(k.shape)
         for i in range(s):
@@ -424,7 +422,7 @@ def _implicit_step(tableau: ImplicitTableau, space: DualSpace, rates: _Rates, h:
 def _settled(change: Array, last: Array, numbers: Array) -> tuple[bool, Array]:
     """Return whether Newton's corrections, one row per state, are rounding of these numbers, and their sizes."""
     far, limit = np.abs(change).max(axis=-1, initial=0.0), np.abs(numbers).max(axis=-1, initial=1.0)
-    done = (far <= 4 * EPS * limit) | ((far >= last / 2) & (far <= _STALLED_CORRECTION * limit))
+    done = (far <= 4 * EPS * limit) | ((far >= last / 2) & (far <= ITERATED * limit))
     return bool(done.all()), far
 
 
@@ -438,7 +436,7 @@ def momentum_step_slopes(
     n = model.nv
     y = np.concatenate([Space(model).to_integrator_velocity(q, v), v], axis=-1)
     last = np.full(y.shape[:-1], np.inf)
-    for _ in range(_MAX_NEWTON_ITERATIONS):
+    for _ in range(MAX_NEWTON_ITERATIONS):
         residual, by_y, by_x, q1, q1_by_y, q1_by_x = equations(q, y[..., :n], y[..., n:])
         change = np.asarray(np.linalg.solve(by_y, residual)[..., 0])
         y = y - change

@@ -14,15 +14,13 @@ from typing import Final
 
 import numpy as np
 
-from mbkit._check import EPS, Array
+from mbkit._check import EPS, PRINTED, Array
 from mbkit.identify.measurements import Equations
 from mbkit.model.base_parameters import eliminated
 
 #: Singular values below this part of the largest one are directions that the data cannot tell. The rest of
 #: geometry that counts as parallel is 1e-7 for base parameters; noise would be blown up as much.
 SINGULAR_VALUE_RATIO: Final = 1e-8
-#: Entries below this part of a direction's largest one are rounding.
-_DIRECTION_ENTRY_RATIO: Final = 1e-6
 _MAX_REWEIGHTINGS: Final = 10
 #: Least noise, relative to the largest noise or torque; a torque may be exact, or always zero.
 MIN_NOISE_RATIO: Final = 1e-6
@@ -140,5 +138,5 @@ def _directions(null: Array, scale: Array) -> Array:
     if not len(null):
         return null
     eliminated_columns, unit = eliminated(null)
-    unit[np.abs(unit) < _DIRECTION_ENTRY_RATIO * np.abs(unit).max(axis=1, keepdims=True)] = 0.0
+    unit[np.abs(unit) < PRINTED * np.abs(unit).max(axis=1, keepdims=True)] = 0.0
     return np.asarray(unit * scale[eliminated_columns, None] / scale)

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 import sympy as sp
 
-from mbkit._check import EPS, Array
+from mbkit._check import EPS, TYPED, Array
 from mbkit._reproducible import DEPENDENT, pivoted
 from mbkit.derivation.kinematics import Kinematics, compensation_energies, gravity_energy, kinetic_energy
 from mbkit.derivation.model_values import Values
@@ -382,9 +382,7 @@ def rolling(kin: SymbolicKinematics, part: NoSlip) -> tuple[list[sp.Expr], list[
     speeds = [material(way, point, at) for way, point in zip(ways, (centre, ground), strict=True)]
     gap, velocity = ([c - d for c, d in zip(*two, strict=True)] for two in ((centre, ground), speeds))
     both = [[tidy(row) for row in rows] for rows in place.rows(gap, velocity, x.speed)]
-    position_rows, velocity_rows = (
-        [x for x in rows if not (x.is_number and abs(x) < _CLOSING_GAP_RATIO)] for rows in both
-    )
+    position_rows, velocity_rows = ([x for x in rows if not (x.is_number and abs(x) < TYPED)] for rows in both)
     still = [row for row in (*position_rows, *velocity_rows) if not row.free_symbols & {*kin.symbols, *kin.rates}]
     if still or not (position_rows or velocity_rows):
         raise InputError(
@@ -405,9 +403,6 @@ def written_rows(kin: SymbolicKinematics, part: Any) -> tuple[list[sp.Expr], lis
 #
 # Both ends are written in the axes of the last body that their ways to the ground share. So the rows hold the joints of
 # the loop only, and a plane mechanism has no row across its plane. Dependent rows are left out.
-
-#: Ends meet up to this part of the largest number, or angle in rad, as numbers are typed with few digits.
-_CLOSING_GAP_RATIO: Final = 1e-9
 
 
 def closure(kin: SymbolicKinematics, loop: Loop) -> list[sp.Expr]:
@@ -464,9 +459,7 @@ def _in_plane(
     about = float(turn @ axis)
     start = atan2(about, (np.trace(E) - 1) / 2)
     # Whatever turns about the axis leaves the rest as it is.
-    if np.abs(E @ axis - axis).max() > _CLOSING_GAP_RATIO or (
-        not axis.any() and np.abs(E - np.eye(3)).max() > _CLOSING_GAP_RATIO
-    ):
+    if np.abs(E @ axis - axis).max() > TYPED or (not axis.any() and np.abs(E - np.eye(3)).max() > TYPED):
         raise InputError(f"{kin.model.name}: {message}, whatever the joints do; turn one of them by rotation_a")
     total = angle(start)
     for sign, way in zip((1, -1), ends, strict=True):
@@ -476,7 +469,7 @@ def _in_plane(
         total += sp.Add(*(sign * s * x for s, x in zip(signs, angles, strict=True)))
     total = sp.expand(total)
     if not total.free_symbols & set(kin.symbols):
-        if abs(sp.sin(total / 2).evalf()) < _CLOSING_GAP_RATIO:
+        if abs(sp.sin(total / 2).evalf()) < TYPED:
             return []
         raise InputError(f"{kin.model.name}: {message}: between them stays an angle of {total}")
     return [2 * sp.sin(total / 2)]
@@ -515,7 +508,7 @@ def _independent(kin: SymbolicKinematics, sums: list[TrigPolynomial], messages: 
     for i in sorted({*range(len(sums))} - {*pivots}):
         weights = np.linalg.lstsq(A[pivots][:, moving].T, A[i, moving], rcond=None)[0]
         left = A[i] - weights @ A[pivots]
-        if np.abs(left[~moving]).max(initial=0.0) > _CLOSING_GAP_RATIO * largest:
+        if np.abs(left[~moving]).max(initial=0.0) > TYPED * largest:
             rest = kin.shown(TrigPolynomial(kin.formulas, {k: x for k, x in sums[i].terms.items() if not kin.moves(k)}))
             why = f": {f'{float(rest):.6g}' if rest.is_number else rest} is left between them"
             raise InputError(f"{kin.model.name}: {messages[i]}, whatever the joints do{'' if weights.any() else why}")

@@ -11,6 +11,7 @@ A chart serves while its dependent block of J is not much nearer to singular tha
 
 from __future__ import annotations
 
+import sys
 from collections import deque
 from typing import Any, ClassVar, Final, NamedTuple
 
@@ -25,6 +26,7 @@ from mbkit.engines.base import QUANTITIES, Dynamics
 from mbkit.engines.constrained import ASKED
 from mbkit.engines.constraint_manifold import Manifold, require_few
 from mbkit.engines.lagrangian import LagrangianDynamics
+from mbkit.engines.steps import MAX_NEWTON_ITERATIONS
 from mbkit.errors import InputError, NumericalError, require_known
 from mbkit.lagrangian.energy_model import abstract_parts
 from mbkit.model import Model
@@ -38,7 +40,6 @@ EMBEDDED: Final = Path(
     asks=ASKED,
     instead="mbkit.simulate(lag.dynamics(), ...) holds them by multipliers, and maggi() has equations without these",
 )
-_MAX_NEWTON_ITERATIONS: Final = 25
 #: Places from which the next one is searched: more than a step has stages.
 _MAX_STARTS: Final = 32
 # Beyond such a change of J, relative to its size, Newton's iteration may end on another
@@ -46,7 +47,6 @@ _MAX_STARTS: Final = 32
 _MAX_JACOBIAN_CHANGE: Final = 0.5
 # Size of Newton's last step, relative to the coordinates.
 _NEWTON_STEP_RATIO: Final = 1e-9
-_TINY: Final = float(np.finfo(float).tiny)
 
 #: A pose is near a singular one where the smallest singular value of J, or of the
 #: dependent block, is below this part of the largest of J.
@@ -132,7 +132,7 @@ class EmbeddedDynamics(Dynamics):
         q, before = q.copy(), J
         q[chart.dependent] -= self._solved(J, J[:, chart.independent] @ (u - q[chart.independent]), q)
         q[chart.independent] = u
-        for _ in range(_MAX_NEWTON_ITERATIONS):
+        for _ in range(MAX_NEWTON_ITERATIONS):
             f, J = self._manifold.call("constraint_rows", q)
             step = self._solved(J, f[:, 0], q)
             q[chart.dependent] -= step
@@ -267,13 +267,13 @@ class Embedded:
     def quality(self, chart: Chart, q: Array, t: float) -> float:
         """Return the smallest singular value of the dependent block over that of J: small where it is a bad choice."""
         J = self.manifold.at(t).jacobian(q)
-        return _smallest(J[:, chart.dependent]) / max(_smallest(J), _TINY)
+        return _smallest(J[:, chart.dependent]) / max(_smallest(J), sys.float_info.min)
 
     def nearness(self, chart: Chart, q: Array, t: float) -> float:
         """Return the smallest singular value over the largest: of J, or of a dependent block that is to stay."""
         J = self.manifold.at(t).jacobian(q)
         block = J if self.independent is None else J[:, chart.dependent]
-        return _smallest(block) / max(float(np.linalg.norm(J, 2)), _TINY)
+        return _smallest(block) / max(float(np.linalg.norm(J, 2)), sys.float_info.min)
 
     def on(self, chart: Chart, q: Array, t: float) -> EmbeddedDynamics:
         """Return the dynamics on a chart's independent coordinates, from a consistent configuration on."""

@@ -18,9 +18,9 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit import spatial
-from mbkit._check import Array
+from mbkit._check import MAX_MAGNITUDE, Array
 from mbkit.load.mjcf_reader import MjcfJoint, Scene
-from mbkit.load.xml_reader import MAX_MAGNITUDE, Element, Reader, reserved
+from mbkit.load.xml_reader import Element, Reader, reserved
 from mbkit.model import GravityCompensation, Joint, JointCoupling, Model, ModelBuilder, PointSpring
 from mbkit.model.description import LEFT_OUT, SERVOS
 from mbkit.model.elements.forces import RATE

@@ -16,7 +16,7 @@ from typing import Final, NoReturn
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
-from mbkit._check import shown
+from mbkit._check import MAX_MAGNITUDE, shown
 from mbkit.errors import InputError, LoadError
 from mbkit.model.builder import MAX_NAME_LENGTH
 
@@ -245,8 +245,6 @@ def element_text(tag: str, attributes: Mapping[str, str], inside: str = "") -> s
 # Numbers and names in attributes
 
 _NUMBER: Final = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
-#: Larger than anything that moves, and the products of several still fit a double.
-MAX_MAGNITUDE: Final = 1e30
 
 
 class Reader:

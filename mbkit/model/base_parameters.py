@@ -28,7 +28,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import Array, real, shown
+from mbkit._check import TYPED, Array, real, shown
 from mbkit._escape import html, terminal
 from mbkit.errors import InputError, NumericalError
 from mbkit.model import manifold
@@ -50,8 +50,6 @@ OF_JOINTS: Final = (Joint.adding_to("loss") + Joint.adding_to("jump"), Joint.add
 TOLERANCE: Final = 1e-7
 #: Rounding of a coefficient, and of right angles in a file: π is often written with eleven digits.
 _COEFFICIENT_ROUNDING: Final = 1e-10
-#: Spread of a body's mass, beside the square of the mechanism's length, that counts as none.
-_MASS_SPREAD_RATIO: Final = 1e-9
 #: How much smaller than the least kept singular value the largest dropped one has to be.
 _SINGULAR_VALUE_GAP: Final = 100.0
 #: A column whose independent part is this part of the largest one may be eliminated.
@@ -232,7 +230,7 @@ def body_of(before: Body, parameters: Array, length: float) -> Body | None:
     c = skew(com)
     inertia = about_origin + mass * c @ c
     spread, axes = np.linalg.eigh(0.5 * np.trace(inertia) * np.eye(3) - inertia)
-    if -_MASS_SPREAD_RATIO * mass * length**2 < spread[0] < 0:
+    if -TYPED * mass * length**2 < spread[0] < 0:
         spread = np.maximum(spread, 0.0)
         inertia = np.sum(spread) * np.eye(3) - (axes * spread) @ axes.T
     return replace(before, mass=mass, com=com, inertia=inertia)

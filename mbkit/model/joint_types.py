@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mbkit import spatial
-from mbkit._check import Array
+from mbkit._check import ITERATED, Array
 from mbkit.errors import InputError, UnsupportedError
 
 Scalars = Sequence[Any]
@@ -422,7 +422,6 @@ _ATTRIBUTES: Final = tuple(JointType.__annotations__)
 _REAL: Final = SimpleNamespace(sin=np.sin, cos=np.cos)
 #: Complex step: derivatives to rounding.
 _COMPLEX_STEP: Final = 1e-30
-_FORMULA_ROUNDING: Final = 1e-11
 
 
 def register_joint_type(joint_type: JointType) -> JointType:
@@ -544,20 +543,20 @@ def _formula_faults(joint_type: JointType) -> Iterator[str]:
         expected = f"expected qdot, R, p, linear, angular, pullback and hamel of nq = {nq} and nv = {nv}"
         yield f"a formula returns another size: {expected}, got shapes {shapes}"
         return
-    if not np.abs(R.real @ R.real.T - np.eye(3)).max() < _FORMULA_ROUNDING or not np.linalg.det(R.real) > 0:
+    if not np.abs(R.real @ R.real.T - np.eye(3)).max() < ITERATED or not np.linalg.det(R.real) > 0:
         yield "placement: R is not a rotation matrix"
     rate, spin = R.real.T @ p.imag / _COMPLEX_STEP, R.real.T @ R.imag / _COMPLEX_STEP
     turning = np.array([spin[2, 1], spin[0, 2], spin[1, 0]])
-    if not np.abs([linear - rate, angular - turning]).max() < _FORMULA_ROUNDING * max(1.0, np.abs(rate).max()):
+    if not np.abs([linear - rate, angular - turning]).max() < ITERATED * max(1.0, np.abs(rate).max()):
         x = [np.round(y, 6).tolist() for y in (rate, turning, q, linear, angular)]
         expected = f"expected the rate of the placement, linear {x[0]} and angular {x[1]} at q = {x[2]}"
         yield f"twist: {expected}, got {x[3]} and {x[4]}"
     if k is None and not np.array_equal(D, np.eye(nv)):
         yield "qdot: expected v, for a type without a quaternion"
-    if not np.abs(pulled - D.T @ g).max() < _FORMULA_ROUNDING * nq:
+    if not np.abs(pulled - D.T @ g).max() < ITERATED * nq:
         yield "pullback: expected D(q)ᵀ g, with D of qdot"
     brackets = np.einsum("ijk,j,k->i", _structure(joint_type, q, D), v, momentum)
-    if not np.abs(hamel - brackets).max() < _FORMULA_ROUNDING * nq:
+    if not np.abs(hamel - brackets).max() < ITERATED * nq:
         x = [y.round(6).tolist() for y in (brackets, hamel)]
         yield f"hamel: expected {x[0]}, by the brackets of D's columns, got {x[1]}"
     opaque = {i for i in joint_type.angular if i not in joint_type.screws}

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, finite_array, shown
+from mbkit._check import PRINTED, Array, finite_array, shown
 from mbkit.errors import ModelError
 from mbkit.model.joint_types import JointType, kind_of, register_joint_type
 
@@ -25,8 +25,6 @@ from mbkit.model.joint_types import JointType, kind_of, register_joint_type
 #: inertias beside it are those of a fixed joint to the last bit.
 RESTING: Final = 1e30
 _ONE: Final = np.eye(3)
-#: Defect of orthogonality and symmetry that a matrix with a file's digits may have.
-_ROTATION_DEFECT: Final = 1e-6
 
 
 #: Names of the entries of an axis of three or six numbers.
@@ -133,7 +131,7 @@ Constants = Annotated[Array, NumberRule(shape=("symbols",))]
 
 def _turns(R: Array) -> bool:
     """Return whether a matrix is a rotation; one of unknown numbers may be."""
-    return not np.isfinite(R).all() or bool(np.abs(R @ R.T - _ONE).max() <= _ROTATION_DEFECT and np.linalg.det(R) > 0)
+    return not np.isfinite(R).all() or bool(np.abs(R @ R.T - _ONE).max() <= PRINTED and np.linalg.det(R) > 0)
 
 
 def read_only(array: Array) -> Array:
@@ -161,7 +159,7 @@ class _Frozen:
                 raise self._fault(f"{name}: expected shape {wanted}, got {number.shape}")
             if name.startswith("rotation") and not _turns(number):
                 raise self._fault(f"{name} is not a rotation matrix; expected R Rᵀ = 1 and det R = 1")
-            if name == "inertia" and np.abs(number - number.T).max() > _ROTATION_DEFECT * np.abs(number).max():
+            if name == "inertia" and np.abs(number - number.T).max() > PRINTED * np.abs(number).max():
                 raise self._fault("inertia is not symmetric; expected I = Iᵀ")
             object.__setattr__(self, name, float(number) if wanted == () else read_only(number))
 

@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
-from mbkit._check import EPS, Array, by_key
+from mbkit._check import EPS, PRINTED, Array, by_key
 from mbkit.errors import InputError, ModelError, Suggestions, did_you_mean
 from mbkit.model import manifold
 from mbkit.model.description import Description
@@ -239,8 +239,6 @@ def _mimic_faults(joints: Sequence[Joint]) -> Iterator[str]:
         ends |= seen
 
 
-# A thin plate written with six digits may miss A + B >= C by its last digit.
-_TRIANGLE_DEFECT = 1e-6
 _JOINT = re.compile(r"joint '.*?'(?=, so)")
 # Ten times mjMINVAL is left of MuJoCo's smallest numbers, in kg and kg m².
 _MIN_MASS_OR_MOMENT = 1e-14
@@ -266,7 +264,7 @@ def body_fault(body: Body, *, point_masses: bool) -> str | None:
     moments = f"principal moments {', '.join(f'{x:.4g}' for x in eigenvalues)} kg m²"
     if eigenvalues[0] < -1e-12 * largest:
         return f"inertia is not positive: {moments}"
-    if eigenvalues[0] + eigenvalues[1] < eigenvalues[2] * (1 - _TRIANGLE_DEFECT):
+    if eigenvalues[0] + eigenvalues[1] < eigenvalues[2] * (1 - PRINTED):
         return f"inertia violates A + B >= C: {moments}"
     return None
 

@@ -19,7 +19,7 @@ from typing import Any, Final, overload
 
 import numpy as np
 
-from mbkit._check import Array, by_key, count, finite_array, real, shown
+from mbkit._check import ROUNDING, Array, by_key, count, finite_array, real, shown
 from mbkit._escape import csv_text, html
 from mbkit._warn import warn
 from mbkit.engines.base import Dynamics
@@ -44,8 +44,6 @@ Spread = float | tuple[float, float] | Callable[[np.random.Generator, int], Any]
 _INERTIAL: Final = ".inertial"
 #: Standard deviation of a logarithm beyond which it is a factor of more than e: per cent are a common reason.
 _WIDE_LOG_DEVIATION: Final = 1.0
-#: Part of a moment of inertia that is rounding.
-_MOMENT_ROUNDING: Final = 1e-12
 _MAX_SHOWN_NUMBERS: Final = 12
 _LOWER: Final = np.tril_indices(3)
 
@@ -282,7 +280,7 @@ def _bodies_drawn(
     second = 0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia
     try:
         # A rod or a point has none across.
-        L = np.linalg.cholesky(second + _MOMENT_ROUNDING * max(np.trace(second), body.mass * 1e-9) * np.eye(3))
+        L = np.linalg.cholesky(second + ROUNDING * max(np.trace(second), body.mass * 1e-9) * np.eye(3))
     except np.linalg.LinAlgError:
         raise InputError(
             f"spread: body {name!r} has an inertia that no matter has, so that none is drawn about it; correct it"
@@ -336,7 +334,7 @@ def _require_bodies_that_can_be(model: Model, values: Mapping[str, Array], scale
             moments, says = 0.5 * (every + every.swapaxes(1, 2)), f"a {field} that drives the motion"
             instead = "give a smaller spread"
         least = np.linalg.eigvalsh(moments)[:, 0]
-        if len(bad := np.flatnonzero(least < -_MOMENT_ROUNDING * np.abs(trace))):
+        if len(bad := np.flatnonzero(least < -ROUNDING * np.abs(trace))):
             raise InputError(
                 f"spread: {name!r} has {says} in {len(bad)} of {size} variants, such as {bad[0]}; {instead}"
             )

@@ -17,9 +17,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array
+from mbkit._check import CONSISTENT, Array
 from mbkit.engines.closed_loops.actuation import Actuation, spread
-from mbkit.engines.constrained import CONSISTENT
 from mbkit.engines.frames_and_momenta import ALIGNED, LOCAL, WORLD, axes_named
 from mbkit.engines.loads import LOADS, Loads
 from mbkit.errors import InputError

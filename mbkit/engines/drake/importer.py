@@ -44,7 +44,6 @@ _KINDS: Final = {
     "ball_rpy": "ball",
     "quaternion_floating": "free",
 }
-_FULL_TURN: Final = 2 * np.pi
 #: Name of a text in Drake and sdformat.
 _PLACE: Final = re.compile(r"<(?:literal|data)-string>(?:\.sdf)?:")
 #: Elements that act, and that Drake passes over without a word.
@@ -319,7 +318,7 @@ def _numbers(joint: Any, kind: str, effort: float, rotor: float) -> tuple[str, d
         numbers |= {"velocity_limit": np.array(joint.velocity_upper_limits())}
         numbers |= dict.fromkeys(Joint.adding_to("T"), np.full(1, rotor))
         if kind == "helical":
-            numbers["pitch"] = float(joint.screw_pitch()) / _FULL_TURN
+            numbers["pitch"] = float(joint.screw_pitch()) / (2 * np.pi)
         if kind == "revolute" and not np.isfinite([lower, upper]).any():
             kind = "continuous"
     return kind, numbers

@@ -26,7 +26,6 @@ from mbkit.model.elements.paths import Path
 from mbkit.model.parts import Loop, PointSpring
 from mbkit.model.validation import static_bodies
 
-_FULL_TURN: Final = 2 * np.pi
 #: Name of the method that runs loops.
 SAP: Final = "drake_sap"
 #: Drake 1.51: evaluating a continuous plant's accelerations with constraints is an error.
@@ -231,7 +230,7 @@ def _one(plant: Any, joint: Joint, k: int, name: str, kind: str, axis: Array, at
         added = plant.AddJoint(tree.PrismaticJoint(name, at, body, axis, damping=damping))
     else:
         # Metres per radian here, per turn there.
-        added = plant.AddJoint(tree.ScrewJoint(name, at, body, axis, _FULL_TURN * joint.pitch, damping))
+        added = plant.AddJoint(tree.ScrewJoint(name, at, body, axis, 2 * np.pi * joint.pitch, damping))
     if rotor := float(joint.rotors[k]):
         actuator = plant.AddJointActuator(f"{name}.rotor", added)
         actuator.set_default_rotor_inertia(rotor)

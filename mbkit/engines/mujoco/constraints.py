@@ -39,9 +39,6 @@ from mbkit.model import Model
 if TYPE_CHECKING:
     from mbkit.engines.closed_loops.frame_rows import Rows
 
-#: Bounds that MuJoCo keeps an impedance in, and the least size that it divides by (mjMINIMP, mjMAXIMP, mjMINVAL).
-_MIN_IMPEDANCE, _MAX_IMPEDANCE = 1e-4, 0.9999
-_MIN_DIVISOR: Final = 1e-15
 _DEFAULT_SOLREF: Final = (0.02, 1.0)
 _DEFAULT_SOLIMP: Final = (0.9, 0.95, 0.001, 0.5, 2.0)
 #: MuJoCo's equality for each kind of loop that it holds.
@@ -77,10 +74,10 @@ class Softness:
             # MuJoCo would take its default instead, after a warning.
             raise InputError(f"solref: expected two positive or two negative numbers, got {tuple(ref.tolist())}")
         bounded = imp[[0, 1, 3]]
-        within = (bounded >= _MIN_IMPEDANCE).all() and (bounded <= _MAX_IMPEDANCE).all()
+        within = (bounded >= mujoco.mjMINIMP).all() and (bounded <= mujoco.mjMAXIMP).all()
         if not (within and imp[2] > 0 and imp[4] >= 1):
             raise InputError(
-                f"solimp: expected impedances and a midpoint from {_MIN_IMPEDANCE} to {_MAX_IMPEDANCE}, a width "
+                f"solimp: expected impedances and a midpoint from {mujoco.mjMINIMP} to {mujoco.mjMAXIMP}, a width "
                 f"above 0 and a power from 1 on, got {tuple(imp.tolist())}"
             )
         return cls(tuple(ref.tolist()), tuple(imp.tolist()))
@@ -127,7 +124,7 @@ def stiffest(dt: float) -> dict[str, tuple[float, ...]]:
     """
     return {
         "solref": (2 * real("dt", dt, positive=True), 1.0),
-        "solimp": (_MAX_IMPEDANCE, _MAX_IMPEDANCE, *_DEFAULT_SOLIMP[2:]),
+        "solimp": (mujoco.mjMAXIMP, mujoco.mjMAXIMP, *_DEFAULT_SOLIMP[2:]),
     }
 
 
@@ -205,7 +202,7 @@ def law(
             continue
         weights = sum(m.body_invweight0[m.site_bodyid[s]] for s in (m.eq_obj1id[i], m.eq_obj2id[i]))
         estimate[own] = np.repeat(weights, 3)[: len(own)]
-    R = np.maximum((1 - impedance) / impedance * estimate, _MIN_DIVISOR)
+    R = np.maximum((1 - impedance) / impedance * estimate, mujoco.mjMINVAL)
     reference = -damping * rate - stiffness * impedance * r - bias
     # In coordinates in which M is the identity.
     L = np.linalg.cholesky(M)
@@ -228,7 +225,7 @@ def friction_law(
     which = np.flatnonzero(m.dof_frictionloss)
     J, rate, none = np.eye(m.nv)[which], d.qvel[which], np.zeros(len(which))
     impedance = none + softness.impedance(0.0)
-    R = np.maximum((1 - impedance) / impedance * m.dof_invweight0[which], _MIN_DIVISOR)
+    R = np.maximum((1 - impedance) / impedance * m.dof_invweight0[which], mujoco.mjMINVAL)
     reference = -softness.gains[1] * rate
     responses, free = np.linalg.solve(M, J.T), np.linalg.solve(M, d.qfrc_smooth)
     f = forces_at_rest(

@@ -24,8 +24,6 @@ from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import Path
 
 _TYPES: Final = tuple(KINDS)
-# MuJoCo refuses principal moments below 1e-15 kg m²; twice that is written.
-_MIN_WRITTEN_MOMENT: Final = 2e-15
 
 
 def _numbers_not_held(model: Model) -> Iterator[str]:
@@ -135,7 +133,7 @@ def _body(body: Any, owners: dict[str, Joint], placed: Placed, model: Model, ind
 
 def _allowed(moments: Array) -> Array:
     """Return principal moments that MuJoCo takes: a point's are lifted off zero, a plate's last digit lowered."""
-    out = np.maximum(moments, _MIN_WRITTEN_MOMENT)
+    out: Array = np.maximum(moments, 2 * mujoco.mjMINVAL)
     low, middle, high = np.argsort(out)
     if out[low] + out[middle] < out[high]:
         # Half of the missing amount on each side; a thin plate misses a rounding.

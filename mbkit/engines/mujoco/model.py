@@ -71,8 +71,6 @@ _BALL, _FREE = mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE
 _X, _Y, _Z = np.eye(3)
 # A ball joint can only be the last of a stack: its quaternion is in the body's own axes.
 _STACKABLE: Final = tuple(STACKS)
-# MuJoCo's compiler refuses principal moments below this, kg m² (mjMINVAL).
-_MIN_PRINCIPAL_MOMENT: Final = 1e-15
 _OPEN_RANGE: Final = 1e10
 #: Numbers of a coupling that a tendon has by the same name, its inertia among them.
 OF_COUPLING: Final = tuple(name for name, rule in rules_of(JointCoupling).items() if rule.does)
@@ -322,7 +320,7 @@ def _give_inertia(new: Any, body: Body, description: Model, placed: Placed) -> N
     listed = {name for name, _ in description.nonphysical}
     low, middle, high = np.sort(moments)
     harmless = body.name in placed.static or (body.mass > 0 and body.name not in listed)
-    if harmless and (low < _MIN_PRINCIPAL_MOMENT or low + middle < high):
+    if harmless and (low < mujoco.mjMINVAL or low + middle < high):
         # A point mass, a thin rod or a plate is a fair idealization, and a body fixed to the world may have any
         # inertia. The compiler refuses them: they are compiled with a placeholder and get their own moments afterwards.
         placed.degenerate[body.name] = moments

@@ -19,8 +19,6 @@ _TYPES: Final = {
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
     "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
 }
-#: Group that viewers show, and that menageries use for shapes alone.
-_VISUAL_GROUP: Final = 2
 
 
 def add_shapes(spec: Any, bodies: Mapping[str, Any], description: Model, shapes: Sequence[Shape]) -> None:
@@ -35,7 +33,7 @@ def add_shapes(spec: Any, bodies: Mapping[str, Any], description: Model, shapes:
     for shape in shapes:
         if shape.body not in bodies:
             continue
-        look: dict[str, Any] = {"pos": shape.translation, "quat": wxyz(shape.rotation), "group": _VISUAL_GROUP}
+        look: dict[str, Any] = {"pos": shape.translation, "quat": wxyz(shape.rotation), "group": 2}
         look |= {"mass": 0.0, "contype": 0, "conaffinity": 0}
         body = bodies[shape.body]
         if shape.kind != "mesh":

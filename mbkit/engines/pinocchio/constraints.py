@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pinocchio as pin
 
-from mbkit._check import Array
+from mbkit._check import ITERATED, Array
 from mbkit._reproducible import under_rows
 from mbkit.engines.closed_loops.actuation import spread
 from mbkit.engines.closed_loops.rows_of_frames import RowsOfFrames
@@ -55,8 +55,6 @@ _MAX_PROXIMAL_ITERATIONS: Final = 20
 _PROXIMAL_ACCURACY: Final = 1e-14
 #: Pivot of a row that may depend on the others, in terms of μ, which leaves about as much of it: LAPACK decides then.
 _DEPENDENT_PIVOT_RATIO: Final = 1e3
-#: Disagreement of the ends' accelerations in terms of these, up to which an answer is taken.
-_ACCELERATION_DISAGREEMENT: Final = 1e-11
 _ALIGNED: Final = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 _LOCAL: Final = pin.ReferenceFrame.LOCAL
 _ONE: Final = np.eye(3)
@@ -244,7 +242,7 @@ class PinConstraints:
                 x, y = (x + v_a.cross(v_b)).vector, y.vector
             (*x,), (*y,) = x.tolist(), y.tolist()
             size = max(map(abs, (*x, *y)))
-            if not max(abs(s - t) for s, t in zip(x, y, strict=True)) <= _ACCELERATION_DISAGREEMENT * max(size, 1e-3):
+            if not max(abs(s - t) for s, t in zip(x, y, strict=True)) <= ITERATED * max(size, 1e-3):
                 return False
         return True
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import mpmath
 import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, real_array, require_finite
+from mbkit._check import ROUNDING, Array, real_array, require_finite
 from mbkit._escape import one_line
 from mbkit.errors import InputError
 from mbkit.lagrangian.continua.densities import Densities
@@ -19,9 +19,6 @@ from mbkit.lagrangian.continua.integrals import Shape, read_shape
 from mbkit.lagrangian.continua.reduction import Reduction
 from mbkit.lagrangian.continua.ritz import NormalModes
 from mbkit.lagrangian.energies.symbols import listed, name_of, plain, velocity_of
-
-#: A fixed place may move by this part of a shape's largest value.
-_FIXED_DISPLACEMENT_RATIO: Final = 1e-12
 
 
 @dataclass(frozen=True, repr=False)
@@ -119,7 +116,7 @@ def _require_fixed(system: Densities, what: str, mode: tuple[Shape, ...]) -> Non
             k, (along, _) = system.jets.order(s)
             shape = mode[k].slope(along)
             size = max((abs(shape(x / 8)) for x in range(9)), default=0)
-            if abs(shape(place)) > _FIXED_DISPLACEMENT_RATIO * size:
+            if abs(shape(place)) > ROUNDING * size:
                 raise InputError(
                     f"{what}: {s} = {mpmath.nstr(shape(place), 6)} at {system.jets.x} = {end}, where it is fixed; a "
                     "shape must keep what `fixed` says"

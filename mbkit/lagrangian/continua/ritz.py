@@ -12,7 +12,7 @@ import mpmath
 import numpy as np
 import sympy as sp
 
-from mbkit._check import Array, real
+from mbkit._check import ITERATED, ROUNDING, Array, real
 from mbkit._check import count as counted
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.lagrangian.continua.densities import Densities
@@ -49,10 +49,8 @@ _MATRIX_DIGITS: Final = 200
 _SHAPE_DIGITS: Final = 60
 #: Monomials beside 2 n for n modes; so many more have to give the same frequencies, in so many refinements.
 _EXTRA_MONOMIALS, _ADDED_MONOMIALS, _MAX_REFINEMENTS = 12, 6, 4
-_EIGENVALUE_CHANGE: Final = 1e-11
-#: A pivot is zero below this part of its diagonal entry, and a motion rigid below this part of the slowest square.
+#: A pivot is zero below this part of its diagonal entry.
 _ZERO_PIVOT_RATIO: Final = 1e-100
-_RIGID_EIGENVALUE_RATIO: Final = 1e-12
 
 
 def normal_modes(system: Densities, count: int, values: Mapping[Any, float]) -> NormalModes:
@@ -74,7 +72,7 @@ def normal_modes(system: Densities, count: int, values: Mapping[Any, float]) -> 
     before: Any = None
     for step in range(_MAX_REFINEMENTS):
         squares, vectors, shift = ritz.eigenpairs(2 * count + _EXTRA_MONOMIALS + _ADDED_MONOMIALS * step, count)
-        if before is not None and (np.abs(before - squares) <= _EIGENVALUE_CHANGE * max(squares.max(), shift)).all():
+        if before is not None and (np.abs(before - squares) <= ITERATED * max(squares.max(), shift)).all():
             break
         before = squares
     else:
@@ -224,7 +222,7 @@ class _Ritz:
             # The largest flexibilities are the slowest modes, and exact to rounding.
             sizes, ways = np.linalg.eigh((flexibility + flexibility.T) / 2)
             squares = 1 / sizes[::-1][:count] - float(shift)
-            squares[np.abs(squares) < _RIGID_EIGENVALUE_RATIO * float(shift)] = 0.0
+            squares[np.abs(squares) < ROUNDING * float(shift)] = 0.0
             if (squares < 0).any():
                 raise NumericalError(unstable)
             columns = inverse.T * mpmath.matrix(ways[:, ::-1][:, :count].tolist())

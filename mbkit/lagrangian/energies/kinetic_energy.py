@@ -11,12 +11,13 @@ import mpmath
 import numpy as np
 import sympy as sp
 
+from mbkit._check import ROUNDING
 from mbkit._warn import warn
 from mbkit.errors import InputError, MbkitWarning
+from mbkit.lagrangian.trig.shortest_form import PROBE_PLACES
 from mbkit.lagrangian.trig.simplify import (
     MAX_SIMPLIFIED_OPERATIONS,
     PROBE_DIGITS,
-    PROBE_PLACES,
     ZERO_PROBE_RATIO,
     RandomEvaluation,
     settled,
@@ -24,8 +25,7 @@ from mbkit.lagrangian.trig.simplify import (
     tidy_short,
 )
 
-#: Lines through the velocities, and places on each.
-_PROBE_LINES: Final = 4
+#: Places on each line through the velocities.
 _STEPS: Final = (3, 1, -1, -3)
 
 
@@ -97,8 +97,6 @@ def _quadratic(x: sp.Expr, velocities: Sequence[sp.Symbol]) -> bool:
 
 # The test that every motion has kinetic energy, or is bound by a constraint.
 
-#: An eigenvalue is zero, and not negative, within this part of the largest one.
-_ZERO_EIGENVALUE_RATIO: Final = 1e-12
 #: Coordinates at every other place are nearer to zero by this factor.
 _NEAR_ZERO_FACTOR: Final = 1e-3
 #: Characters of a matrix that a message shows.
@@ -167,7 +165,7 @@ def warn_of_negative(
         if entries is None or any(mpmath.im(x) for x in entries):
             return
         sizes, directions = np.linalg.eigh(np.array(entries, dtype=float).reshape(n, n))
-        if sizes[0] >= -_ZERO_EIGENVALUE_RATIO * abs(sizes[-1]):
+        if sizes[0] >= -ROUNDING * abs(sizes[-1]):
             return
         direction = directions[:, 0]
     names = [w.name for w, x in zip(velocities, direction, strict=True) if abs(x) > 1e-6]  # type: ignore[arg-type]

@@ -48,9 +48,9 @@ from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned
 from mbkit.lagrangian.reduction.hamilton import ConservedQuantity, numbers_at
 from mbkit.lagrangian.reduction.quasi_equations import in_quasi_velocities, quasi_equations
+from mbkit.lagrangian.trig.shortest_form import PROBE_PLACES
 from mbkit.lagrangian.trig.simplify import (
     PROBE_DIGITS,
-    PROBE_PLACES,
     ZERO_PROBE_RATIO,
     RandomEvaluation,
     is_zero,

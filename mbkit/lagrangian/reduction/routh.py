@@ -23,7 +23,7 @@ import sympy as sp
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
-from mbkit._check import Array, finite_array, require_finite, rows
+from mbkit._check import TYPED, Array, finite_array, require_finite, rows
 from mbkit._escape import terminal
 from mbkit.engines.base import at_times
 from mbkit.engines.lagrangian import LagrangianDynamics
@@ -260,8 +260,6 @@ def _need_not(ignored: list[sp.Symbol], x: sp.Expr, what: str) -> None:
 
 # SciPy's limit is 100 eps; the norm is a mean over all intervals.
 _QUADRATURE_TOLERANCE: Final = 1e-13
-# The two starts are the same number, rounded apart.
-_START_DIFFERENCE_RATIO: Final = 1e-9
 
 
 def _read(
@@ -308,7 +306,7 @@ def _start(routhian: Routhian[Any], q0: ArrayLike, q: Array) -> Array:
     if len(start) < whole:
         return start
     off = float(np.abs(start[remaining] - q[0]).max())
-    if off > _START_DIFFERENCE_RATIO * (1 + float(np.abs(q[0]).max())):
+    if off > TYPED * (1 + float(np.abs(q[0]).max())):
         names = ", ".join(x.name for x in routhian.lagrangian.coordinates)
         raise InputError(f"q0: its {names} differ from the run's first state by {off:.3g}")
     return start[ignored]

@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import EPS, Array, finite_array, generator
+from mbkit._check import EPS, ITERATED, TYPED, Array, finite_array, generator
 from mbkit._escape import html, terminal
 from mbkit._reproducible import DEPENDENT
 from mbkit.engines.base import Dynamics, at_time
@@ -30,8 +30,6 @@ from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.parts import read_only
 
-#: Forces balance when their sum is below this part of them.
-_BALANCE_RATIO: Final = 1e-11
 #: Forces of a row count as at least this part of the largest row's, whose rounding reaches it.
 _CANCELLED_FORCE_RATIO: Final = 1e-3
 # Random starts, and steps from each.
@@ -43,9 +41,8 @@ _START_HALVINGS: Final = 12
 _NEIGHBOUR_DISTANCE: Final = 0.1
 #: Step of differences of fourth order, whose error is far below half of the digits.
 _DIFFERENCE_STEP: Final = EPS**0.2
-#: s: when a system that depends on the time is looked at again, and what may differ then.
+#: s: when a system that depends on the time is looked at again.
 _LATER: Final = (0.7310585786300049, 2.0178)
-_EQUAL_STATES_RATIO: Final = 1e-9
 #: Rounding of an exact derivative, and of differences, relative to their terms.
 _EXACT_ERROR_RATIO: Final = 8 * EPS
 _DIFFERENCE_ERROR_RATIO: Final = 8 * EPS**0.8
@@ -396,7 +393,7 @@ class _Balance:
         """Return the residual relative to its rounding: of the forces of each row, and beside those of all rows."""
         rows = self.scale(q, tau)[: len(r)]
         sizes = np.maximum(rows, _CANCELLED_FORCE_RATIO * rows.max(initial=0.0))
-        own, left = (float((np.abs(r) / (_BALANCE_RATIO * x)).max(initial=0.0)) for x in (rows, sizes))
+        own, left = (float((np.abs(r) / (ITERATED * x)).max(initial=0.0)) for x in (rows, sizes))
         return own, left
 
     # Small motions
@@ -461,15 +458,13 @@ class _Balance:
             later = _Balance(self._whole, self._wrenches, t)
             theirs = later.multipliers(q, tau)
             left = np.abs(later.residual(q, theirs, tau))
-            if (left > _EQUAL_STATES_RATIO * (1 + later.scale(q, tau)[: len(left)])).any():
+            if (left > TYPED * (1 + later.scale(q, tau)[: len(left)])).any():
                 raise InputError(
                     f"dynamics: {self.model.name} depends on the time {self.model.time_parameter}, which moves it; "
                     "there is no equilibrium of such a system"
                 )
             pairs = zip(now, later._linear(q, theirs), strict=True)
-            differs = differs or any(
-                np.abs(a - b).max(initial=0.0) > _EQUAL_STATES_RATIO * (1 + np.abs(a).max()) for a, b in pairs
-            )
+            differs = differs or any(np.abs(a - b).max(initial=0.0) > TYPED * (1 + np.abs(a).max()) for a, b in pairs)
         return differs
 
 

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _GRID_POINTS: Final = 241
-_ENERGY_LEVELS: Final = 14
-_STREAM_DENSITY: Final = 1.4
 
 
 def portrait(
@@ -86,13 +84,13 @@ def portrait(
     ax = ax or _axes()
     if conserved:
         h = drawn
-        levels = np.unique(np.quantile(h[np.isfinite(h)], np.linspace(0.0, 0.97, _ENERGY_LEVELS)))
+        levels = np.unique(np.quantile(h[np.isfinite(h)], np.linspace(0.0, 0.97, 14)))
         ax.contour(Q, W, h, levels, colors="C0", linewidths=0.9, linestyles="solid")
         saddles = np.unique(on(form.energy_function, rests[slopes > 0], np.zeros(int((slopes > 0).sum()))))
         if len(saddles):
             ax.contour(Q, W, h, saddles, colors="C3", linewidths=1.2, linestyles="dashed")
     else:
-        ax.streamplot(Q[0], W[:, 0], W, drawn, density=_STREAM_DENSITY, color="C0", linewidth=0.9, arrowsize=0.8)
+        ax.streamplot(Q[0], W[:, 0], W, drawn, density=1.4, color="C0", linewidth=0.9, arrowsize=0.8)
     for stable, filled in ((True, "C0"), (False, "none")):
         places = rests[(slopes < 0) == stable]
         ax.plot(places, 0 * places, "o", markerfacecolor=filled, markeredgecolor="C0" if stable else "C3")

@@ -215,9 +215,10 @@ def _power(k: int, kept: int) -> dict[tuple[int, int], int]:
 
 # Sums of products of atoms: what their terms share, and whether they are products of sums.
 
-#: Possible terms up to which a product of sums is looked for, and places at which it is ruled out first.
+#: Random places at which a property of expressions is tested.
+PROBE_PLACES: Final = 4
+#: Possible terms up to which a product of sums is looked for.
 _MAX_DENSE_TERMS: Final = 50_000
-_PROBE_PLACES: Final = 4
 
 #: A product of powers of atoms -> its coefficient.
 Poly = dict[tuple[tuple[sp.Expr, int], ...], Fraction]
@@ -255,7 +256,7 @@ def _irreducible(poly: Poly) -> bool:
     numbers = [int(v * scale) for v in poly.values()]
     shared, rng = gcd(*numbers), Random(0)
     for i, highest in enumerate(max(es) for es in zip(*rows, strict=True)):
-        for _ in range(_PROBE_PLACES if highest == 1 else 0):
+        for _ in range(PROBE_PLACES if highest == 1 else 0):
             at = [rng.randrange(1_000, 1_000_000) for _ in atoms]
             parts = [0, 0]
             for row, x in zip(rows, numbers, strict=True):

@@ -340,8 +340,6 @@ PROBE_DIGITS: Final = 30
 _FINE_DIGITS: Final = 60
 #: A number computed with `PROBE_DIGITS` is zero below this part of those that it is computed from.
 ZERO_PROBE_RATIO: Final = 1e-20
-#: Random places at which a property of expressions is tested.
-PROBE_PLACES: Final = 4
 #: Negligible beside terms of the order of 1.
 _ZERO_VALUE: Final = 1e-50
 #: Places that must agree; more of them where signs decide.

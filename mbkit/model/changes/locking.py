@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, batch_of, finite_array, hint_at_degrees, rows, shown
+from mbkit._check import CONSISTENT, Array, batch_of, finite_array, hint_at_degrees, rows, shown
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model.builder import shape_of
 from mbkit.model.description import expect_name
@@ -38,8 +38,6 @@ from mbkit.model.parameters import Binding, Expression, nominal
 from mbkit.model.parts import Coupler, Joint, JointCoupling, Loop, NoSlip, PointSpring
 from mbkit.model.poses import body_poses
 
-#: Part of limits, and of closed rows, that the digits of a typed number leave.
-_TYPED_DIGITS: Final = 1e-8
 #: The energies, losses, forces and rows of what moves no more are written on what still does.
 LOCK: Final = Path("lock", "lock: not known of", OF_BODIES)
 
@@ -115,7 +113,7 @@ def _given(model: Model, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike
 def _require_limits(model: Model, values: Values) -> None:
     for name, x in values.items():
         joint = model.joint(name)
-        room = _TYPED_DIGITS * np.maximum(1.0, np.abs(x))
+        room = CONSISTENT * np.maximum(1.0, np.abs(x))
         if (x < joint.lower - room).any() or (x > joint.upper + room).any():
             raise InputError(
                 f"joints: {name!r} at {_short(x)} is beyond its limits, {_short(joint.lower)} to {_short(joint.upper)}"
@@ -128,7 +126,7 @@ def _coordinates(joint: Joint, value: Any) -> Array:
         value = [value]
     x = finite_array(item, value, (n,))
     k = joint.type.quaternion
-    if k is not None and abs(float(np.linalg.norm(x[k:])) - 1.0) > _TYPED_DIGITS:
+    if k is not None and abs(float(np.linalg.norm(x[k:])) - 1.0) > CONSISTENT:
         raise InputError(f"{item}: expected a quaternion x, y, z, w of length 1, got {x[k:].tolist()}")
     return x
 
@@ -154,7 +152,7 @@ def _with_followers(model: Model, given: Values) -> Values:
             value = (values[tied.joint][0] - value) / slope
         follows = np.array([value])
         there = values.setdefault(name, follows)
-        if abs(there[0] - follows[0]) > _TYPED_DIGITS * max(1.0, abs(follows[0])):
+        if abs(there[0] - follows[0]) > CONSISTENT * max(1.0, abs(follows[0])):
             raise InputError(f"{item} asks for {name!r} at {follows[0]:g}, and it is locked at {there[0]:g}")
     for joint in model.joints:
         if joint.mimic and joint.mimic.joint in values:
@@ -338,7 +336,7 @@ def _closed_for_good(model: Model) -> tuple[list[Loop], list[str]]:
         if (model.moving(loop.body_a) ^ model.moving(loop.body_b)) & moves:
             continue
         size = max(map(abs, _residual(model, loop)))
-        if not size <= _TYPED_DIGITS:
+        if not size <= CONSISTENT:
             raise InputError(
                 f"joints: locked there, loop {loop.name!r} is open by {size:.3g} and nothing moves it; take the values "
                 "of a state that project returns"

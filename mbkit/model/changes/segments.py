@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import count
+from mbkit._check import TYPED, count
 from mbkit.errors import UnsupportedError
 from mbkit.model.builder import ModelBuilder
 from mbkit.model.elements.beams import BeamEnd
@@ -21,8 +21,6 @@ from mbkit.model.parts import Joint
 SEGMENTED: Final = Path("segmented", "segmented: not known of", ALL)
 #: Part of a segment's inertia that it has about its own axis: a beam has none, and MuJoCo takes no body without.
 _AXIAL_INERTIA_RATIO: Final = 1e-6
-#: Relative spread, by rounding, of the EI that stiffnesses of modes belong to.
-_STIFFNESS_SPREAD: Final = 1e-9
 
 
 def segmented(model: Model, segments: int) -> Model:
@@ -66,7 +64,7 @@ def _numbers(model: Model, joint: Joint, points: list[Joint]) -> tuple[list[Any]
         ("mass of its points", masses, [rho * w for w in beam.weights]),
     ):
         one, other = (np.array([nominal(x) for x in values]) for values in (own, whole))
-        if not np.allclose(one, other, rtol=_STIFFNESS_SPREAD, atol=0.0, equal_nan=True):
+        if not np.allclose(one, other, rtol=TYPED, atol=0.0, equal_nan=True):
             raise UnsupportedError(
                 f"segmented: the {what} of beam {joint.name!r} is not that of one uniform beam: {one}; let add_beam "
                 "set it"

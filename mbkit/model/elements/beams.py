@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.polynomial import Legendre, Polynomial
 
-from mbkit._check import EPS, Array, count, shown
+from mbkit._check import EPS, ROUNDING, Array, count, shown
 from mbkit.errors import InputError
 from mbkit.model.joint_types import KINDS, JointType, Placement, Rows, Scalars, Twist, cross3, register_joint_type
 
@@ -30,8 +30,6 @@ _RULE_ROUNDING: Final = 500 * EPS
 _IDENTITY: Final[Rows] = np.eye(3).tolist()
 #: The straight line from the root.
 _ROOTED: Final = Polynomial((0.0, 1.0))
-#: Motion of its clamp that a shape may have, beside its largest coefficient.
-_CLAMP_MOTION_RATIO: Final = 1e-12
 
 
 #: Lengths, m, of which the third power keeps its digits beside 1.
@@ -108,7 +106,7 @@ def modes_of(modes: Any, shapes: Any, *, string: bool) -> Modes:
             )
             raise InputError(f"shapes[{i}]: expected a {expected}, got {shown(f)}")
         held = abs(f(0.0)) if string else max(abs(f(0.0)), abs(f.deriv()(0.0)))
-        if held > _CLAMP_MOTION_RATIO * np.abs(f.coef).max() or not f.coef.any():
+        if held > ROUNDING * np.abs(f.coef).max() or not f.coef.any():
             where = "at the root" if string else "with its slope at the clamp"
             raise InputError(f"shapes[{i}]: expected zero {where} and not everywhere, got {f}")
     return modes_within(given)

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import ROUNDING, Array
 from mbkit.errors import did_you_mean
 from mbkit.model.elements.formula import Formula
 from mbkit.model.parts import ENTRIES, Constants, NumberRule, Place, Rotation, _Frozen, read_only
@@ -29,8 +29,6 @@ TIME: Final = "t"
 POINT: Final = ENTRIES[:3]
 TWIST: Final = ("vx", "vy", "vz", "wx", "wy", "wz")
 DISPLACEMENT: Final = ENTRIES
-#: Relative asymmetry of a stiffness that is rounding.
-_ASYMMETRY_ROUNDING: Final = 1e-12
 
 
 class Force(_Frozen):
@@ -251,9 +249,9 @@ class Bushing(Force):
             if np.isnan(matrix).any():
                 continue
             size = np.abs(matrix).max()
-            if what == "stiffness" and np.abs(matrix - matrix.T).max() > _ASYMMETRY_ROUNDING * size:
+            if what == "stiffness" and np.abs(matrix - matrix.T).max() > ROUNDING * size:
                 yield "stiffness: expected a symmetric matrix, which has a potential energy; give the rest as a formula"
-            elif np.linalg.eigvalsh((matrix + matrix.T) / 2)[0] < -_ASYMMETRY_ROUNDING * size:
+            elif np.linalg.eigvalsh((matrix + matrix.T) / 2)[0] < -ROUNDING * size:
                 yield f"{what}: expected a matrix without negative eigenvalues, got one that drives the motion"
 
     def __str__(self) -> str:

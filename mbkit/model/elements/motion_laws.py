@@ -14,14 +14,10 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import PRINTED, ROUNDING, Array
 from mbkit.model.elements.formula import Arithmetic, Formula
 from mbkit.model.parts import Constants, NumberRule, OfJoint, Prescribed
 
-#: Part of a table's end by which the rounding of a run's last time can be beyond it.
-_TABLE_END_ROUNDING: Final = 1e-12
-#: Jump of x, x' or x'' between pieces of a spline, beside the largest value, from which it is no rounding.
-_JUMP_RATIO: Final = 1e-6
 _TABLE: Final = NumberRule(shape=None, fixed="it is a table's")
 #: Comparisons of each evaluation grow with the knots: at so many a step takes some 0.1 ms.
 MAX_KNOTS: Final = 2000
@@ -136,7 +132,7 @@ def beyond(motions: tuple[Motion, ...], *times: float) -> str:
     """Return why not all motions are defined at some times; empty where they are."""
     for part in motions:
         first, last = interval(part)
-        slack = _TABLE_END_ROUNDING * (abs(first) + abs(last))
+        slack = ROUNDING * (abs(first) + abs(last))
         for t in times:
             if not first - slack <= t <= last + slack:
                 return (
@@ -180,7 +176,7 @@ def _spline_faults(item: str, part: SplineMotion) -> Iterator[str]:
         starts = c[-1] if len(c) else np.zeros(len(widths))
         size = float(np.abs([ends, starts]).max(initial=0.0))
         jumps = np.abs(ends[:-1] - starts[1:])
-        if size and (jumps > _JUMP_RATIO * size).any():
+        if size and (jumps > PRINTED * size).any():
             k = int(jumps.argmax())
             yield (
                 f"{item}: the {what} jumps by {jumps[k]:.3g} at {knots[k + 1]:.9g} s; expected a spline with a "

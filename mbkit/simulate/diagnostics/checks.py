@@ -13,10 +13,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import EPS, Array
+from mbkit._check import EPS, ROUNDING, Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import DOUBLE_BITS, at_time
-from mbkit.engines.constrained import ROUNDING, off_by
+from mbkit.engines.constrained import off_by
 from mbkit.errors import MbkitError
 from mbkit.methods.registry import ADAPTIVE_METHOD, AUTOMATIC_METHOD, SERIES_METHOD, Method, Tolerances
 from mbkit.methods.stability import companion
