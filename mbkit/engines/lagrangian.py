@@ -11,12 +11,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._attributes import forwarded
 from mbkit._check import Array, count, finite_array, is_on_device, on_host, real
 from mbkit.codegen.backend import DERIVING, compile_by_default, executable, has_compiler
 from mbkit.codegen.interpreter import Machine
-from mbkit.derivation import ELIMINATIONS, Elimination, Equations, elimination_of, equations_of
+from mbkit.derivation import ELIMINATIONS, FUNCTIONS, Elimination, Equations, elimination_of, equations_of
 from mbkit.derivation.body_motion import BODY_QUANTITIES
+from mbkit.derivation.constraints import CONSTRAINT_FUNCTIONS
 from mbkit.derivation.least_constraint import has_squares
 from mbkit.engines.base import DERIVATION, Dynamics, scalar
 from mbkit.engines.elements.added_force import UNDER_FORCE
@@ -35,6 +35,9 @@ if TYPE_CHECKING:
     from mbkit.codegen.cuda.runs import CudaSteps
     from mbkit.derivation.steps.fixed import Part
     from mbkit.engines.compiled_calls import CompiledStep, Plan, QuantityCall
+
+#: Quantity -> its arguments, of those that are written in symbols.
+WRITTEN: Final = FUNCTIONS | CONSTRAINT_FUNCTIONS
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -111,7 +114,7 @@ def _term(name: str) -> Callable[..., Any]:
     return evaluate
 
 
-def _names(value: Any) -> Any:
+def names_of(value: Any) -> Any:
     """Return the names of frames or joints, and anything else as it is."""
     return tuple(x.name for x in value) if isinstance(value, tuple) else value
 
@@ -122,12 +125,55 @@ def _body_term(name: str) -> Callable[..., Any]:
     def evaluate(self: LagrangianDynamics, *given: Any) -> Array:
         # Without frames to act on there is no argument of wrenches.
         n = sum(isinstance(x, np.ndarray) for x in given[: len(states)])
-        return _TRIM[name](self._machine(name, *map(_names, given[n:]))(*given[:n])[0])
+        return _TRIM[name](self._machine(name, *map(names_of, given[n:]))(*given[:n])[0])
 
     return evaluate
 
 
-class LagrangianDynamics(Dynamics):
+def function_of(equations: Equations, name: str, *extra: Any) -> ca.Function:
+    """Return what the derivation has by a name, and by what stands beside it, such as names of frames."""
+    if name in BODY_QUANTITIES:
+        return equations.body_quantity(name, *extra)
+    return equations.function(name) if name in WRITTEN else getattr(equations, name)(*extra)
+
+
+class Derived(Dynamics):
+    """What engines of the own derivation have alike, in double and in more digits."""
+
+    _has_force_elements = True
+    _one_at_a_time = False
+    _path = DERIVATION
+    _why_no_derivatives = ""
+    #: Name, states, and `extra` of `function_of` -> the function's first result.
+    _first: Callable[..., Any]
+
+    def energy_rate(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Any:
+        """Return dE/dt of kinetic and potential energy along (D v, a), exactly differentiated."""
+        return scalar(self._evaluate("energy_rate", q=q, v=v, a=a))
+
+    def _actuator_forces(self, q: Array, v: Array, a: Array, actuators: tuple[Joint, ...]) -> Any:
+        which = self._moved_by(actuators)
+        out = self._first("actuator_forces", q, v, a, extra=(which,))[..., 0]
+        return self._judged(out, q, a, which)
+
+    def _loads_of_motion(self, *given: Any) -> Any:
+        return self._loads(False, *given)
+
+    def _loads_under_force(self, *given: Any) -> Any:
+        return self._loads(True, *given)
+
+    def _loads(self, moved: bool, *given: Any) -> Any:
+        *states, joints, frames, axes = given
+        return self._first("loads", *states, extra=(names_of(joints), names_of(frames), axes, moved))
+
+    def _inverse_dynamics_second_derivatives(self, *states: Array) -> Any:
+        return of_second_order(self._first("inverse_dynamics_second_derivatives", *states))
+
+    def _parameter_derivatives(self, quantity: str, *states: Array) -> Any:
+        return of_parameters(self.model, quantity, self._first("parameter_derivatives", *states, extra=(quantity,)))
+
+
+class LagrangianDynamics(Derived):
     """Terms derived from kinematics and energies, each at its first use.
 
     Parameters
@@ -161,11 +207,8 @@ class LagrangianDynamics(Dynamics):
     """
 
     engine = "lagrangian"
-    _derived = _has_force_elements = True
-    _one_at_a_time = False
+    _derived = True
     _takes_parameters = True
-    _path = DERIVATION
-    _why_no_derivatives = ""
 
     def __init__(
         self,
@@ -225,13 +268,7 @@ class LagrangianDynamics(Dynamics):
         if key not in self._machines:
 
             def derive() -> Any:
-                if make is not None:
-                    return make()
-                if name in BODY_QUANTITIES:
-                    return self.equations.body_quantity(name, *extra)
-                if name == _STACKED:
-                    return self.equations.stacked(*extra)
-                return self.equations.function(name)
+                return function_of(self.equations, name, *extra) if make is None else make()
 
             with DERIVING:
                 starts = [start for start, _ in self.model.quaternions] if name in _TRIM else None
@@ -358,7 +395,7 @@ class LagrangianDynamics(Dynamics):
         short = self._short.get((quantity, *more))
         if short is None and more:
             # Frames and joints are the same objects in the next call, and quicker to look up than their names.
-            short = self._short.get((quantity, *map(_names, more)))
+            short = self._short.get((quantity, *map(names_of, more)))
             if short is not None:
                 self._short[quantity, *more] = short
         if short is not None:
@@ -376,7 +413,7 @@ class LagrangianDynamics(Dynamics):
 
         if quantity in UNDER_FORCE:
             GPU_ARRAYS.admit(self.model, f"{quantity} takes arrays of the host, not of a GPU, for")
-        names = tuple(map(_names, more))
+        names = tuple(map(names_of, more))
         key = (quantity, *names) if quantity in _TRIM else (_STACKED, quantity)
         if key[0] == _STACKED and quantity not in _DERIVATIVES:
             raise UnsupportedError(f"{quantity} takes arrays of the host, not of a GPU; copy them with numpy first")
@@ -402,33 +439,11 @@ class LagrangianDynamics(Dynamics):
     def _trimmed(self, name: str, *arguments: Array) -> Array:
         return _TRIM[name](self._machine(name)(*arguments)[0])
 
-    _mechanism = forwarded("equations", "The equations, of those with constraints.")
+    def _first(self, name: str, *states: Array, extra: tuple[Any, ...] = ()) -> Array:
+        return np.asarray(self._machine(name, *extra)(*states)[0])
 
     def _every_jacobian(self, q: Array) -> Array:
-        code = self._code("every_jacobian", make=lambda: self.equations.function("every_jacobian"))
-        return np.asarray(code(q, *self._trailing(q), threads=self.threads)[0])
-
-    def _actuator_forces(self, q: Array, v: Array, a: Array, actuators: tuple[Joint, ...]) -> Array:
-        which = self._moved_by(actuators)
-        code = self._code("actuator_forces", which, make=lambda: self._mechanism.actuator_forces(which))
-        out = code(q, v, a, *self._trailing(q), threads=self.threads)[0][..., 0]
-        return self._judged(out, q, a, which)
-
-    def _loads_of_motion(self, q: Array, v: Array, a: Array, tau: Array, *given: Any) -> Array:
-        return self._loads(False, q, v, a, tau, *given)
-
-    def _loads_under_force(self, q: Array, v: Array, tau: Array, *given: Any) -> Array:
-        return self._loads(True, q, v, tau, *given)
-
-    def _loads(self, moved: bool, *given: Any) -> Array:
-        *states, joints, frames, axes = given
-        names = _names(joints), _names(frames), axes
-        code = self._code("loads", moved, *names, make=lambda: self._mechanism.loads(*names, moved))
-        return np.asarray(code(*states, *self._trailing(states[0]), threads=self.threads)[0])
-
-    def energy_rate(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Any:
-        """Return dE/dt of kinetic and potential energy along (D v, a), exactly differentiated."""
-        return scalar(self._evaluate("energy_rate", q=q, v=v, a=a))
+        return self._first("every_jacobian", q)
 
     def _stacked(self, name: str, *arguments: Array) -> Array:
         return _TRIM[_STACKED](self._machine(_STACKED, name)(*arguments)[0])
@@ -439,20 +454,10 @@ class LagrangianDynamics(Dynamics):
     def _forward_dynamics_derivatives(self, q: Array, v: Array, tau: Array) -> Array:
         return self._stacked("forward_dynamics_derivatives", q, v, tau)
 
-    def _inverse_dynamics_second_derivatives(self, q: Array, v: Array, a: Array) -> Array:
-        name = "inverse_dynamics_second_derivatives"
-        code = self._code(name, make=lambda: self.equations.inverse_dynamics_second_derivatives())
-        return np.asarray(of_second_order(code(q, v, a, *self._trailing(q), threads=self.threads)[0]))
-
-    def _parameter_derivatives(self, quantity: str, *states: Array) -> Array:
-        code = self._code(f"{quantity}_by_parameters", make=lambda: self.equations.parameter_derivatives(quantity))
-        out = code(*states, *self._trailing(states[0]), threads=self.threads)[0]
-        return np.asarray(of_parameters(self.model, quantity, out))
-
     # Steps
 
     def _under(self, frames: tuple[Frame, ...], axes: str) -> LagrangianDynamics:
-        key = _names(frames), axes
+        key = names_of(frames), axes
         if key in self._wrenched:
             return self._wrenched[key]
         kept: dict[Any, LagrangianDynamics] = self.equations.kept.setdefault("under", {})

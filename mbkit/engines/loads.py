@@ -24,7 +24,6 @@ from mbkit.errors import InputError, require_known
 from mbkit.model import Frame, Joint, PointSpring
 from mbkit.model.elements.kinds import that_do
 from mbkit.model.elements.paths import Path
-from mbkit.model.parts import Loop
 
 #: Wrenches by the names of the frames on which they act.
 Wrenches = Mapping[str, ArrayLike]
@@ -262,12 +261,11 @@ class Loads(Evaluation):
         loads = self.joint_wrenches(q, v, None, wrenches, axes, names, tau)
         balance = _Balance(self, q, v, a)
         if model.loops:
-            for loop, wrench in zip(
-                model.loops, np.moveaxis(self.loop_wrenches(q, v, tau, wrenches, axes), 1, 0), strict=True
-            ):
-                balance.close(loop, wrench)
+            wrenches_of_loops = np.moveaxis(self.loop_wrenches(q, v, tau, wrenches, axes), 1, 0)
+            for loop, wrench in zip(model.loops, wrenches_of_loops, strict=True):
+                balance.load(loop.body_a, loop.body_b, wrench, loop.rotation_a, loop.translation_a)
         for k, joint in enumerate(model.tree):
-            balance.load(joint, loads[:, k])
+            balance.load(joint.child, joint.parent, loads[:, k], np.eye(3), np.zeros(3))
         for name, wrench in pushes.items():
             balance.apply(name, wrench, axes_named(axes))
         for spring in model.springs:
@@ -281,7 +279,7 @@ def _times(R: Array, x: Array) -> Array:
 
 
 class _Balance:
-    """Forces and moments about the origin of each body, gathered in its axes, at a batch of states."""
+    """Forces and moments about the origin of each body, gathered in the world's axes, at a batch of states."""
 
     def __init__(self, dyn: Loads, q: Array, v: Array, a: Array) -> None:
         self._dyn, self._model, self._q, self._v, self._a = dyn, dyn.model, q, v, a
@@ -291,73 +289,44 @@ class _Balance:
         shape = (len(q), len(self._names), 3)
         self._force, self._moment = np.zeros(shape), np.zeros(shape)
 
-    def _rotation(self, body: str) -> Array:
-        return self._X[:, self._index[body], :3, :3]
+    def _push(self, body: str, force: Array, moment: Array | float, point: Array) -> None:
+        if (k := self._index.get(body)) is not None:
+            self._force[:, k] += force
+            self._moment[:, k] += moment + np.cross(point - self._X[:, k, :3, 3], force)
 
-    def _add(self, body: str, force: Array, moment: Array) -> None:
-        if body in self._index:
-            self._force[:, self._index[body]] += force
-            self._moment[:, self._index[body]] += moment
+    def _placed(self, body: str, point: Array) -> tuple[Array, Array]:
+        """Return the rotation of a body or the world, and a point of it."""
+        k = self._index.get(body)
+        X = np.broadcast_to(np.eye(4), (len(self._q), 4, 4)) if k is None else self._X[:, k]
+        return X[:, :3, :3], X[:, :3, 3] + _times(X[:, :3, :3], point)
 
-    def load(self, joint: Joint, wrench: Array) -> None:
-        """Add a joint's load to its child, and the opposite to its parent."""
-        force, moment = wrench[:, :3], wrench[:, 3:]
-        self._add(joint.child, force, moment)
-        if joint.parent in self._index:
-            R, R_P = self._rotation(joint.child), self._rotation(joint.parent)
-            p = self._X[:, self._index[joint.child], :3, 3] - self._X[:, self._index[joint.parent], :3, 3]
-            force = _times(R, force)
-            moment = _times(R, moment) + np.cross(p, force)
-            self._add(joint.parent, -_times(R_P.swapaxes(1, 2), force), -_times(R_P.swapaxes(1, 2), moment))
+    def load(self, to: str, by: str, wrench: Array, rotation: Array, point: Array) -> None:
+        """Add a wrench about a point of a body, in its axes turned by `rotation`, and the opposite to another body."""
+        R, place = self._placed(to, point)
+        force, moment = (_times(R @ rotation, x) for x in (wrench[:, :3], wrench[:, 3:]))
+        self._push(to, force, moment, place)
+        self._push(by, -force, -moment, place)
 
     def apply(self, name: str, wrench: Array, axes: str) -> None:
         """Add a wrench on a frame."""
-        frame = self._model.frame(name)
-        if frame.body not in self._index:
-            return
-        force, moment = wrench[..., :3], wrench[..., 3:]
-        if axes == LOCAL:
-            force, moment = _times(frame.rotation, force), _times(frame.rotation, moment)
-        else:
-            X, R_B = self._dyn.pose(self._q, name), self._rotation(frame.body).swapaxes(1, 2)
-            if axes != ALIGNED:
-                moment = moment - np.cross(X[:, :3, 3], force)
-            force, moment = _times(R_B, force), _times(R_B, moment)
-        self._add(frame.body, force, moment + np.cross(frame.translation, force))
-
-    def close(self, loop: Loop, wrench: Array) -> None:
-        """Add a loop's load to its body a, and the opposite to body b at the same point."""
-        X = self._placed(loop.body_a)
-        arm = _times(X[:, :3, :3], loop.translation_a)
-        force, moment = (_times(X[:, :3, :3] @ loop.rotation_a, x) for x in (wrench[:, :3], wrench[:, 3:]))
-        for sign, body in ((1, loop.body_a), (-1, loop.body_b)):
-            Y = self._placed(body)
-            R, point = Y[:, :3, :3].swapaxes(1, 2), X[:, :3, 3] + arm - Y[:, :3, 3]
-            self._add(body, sign * _times(R, force), sign * _times(R, moment + np.cross(point, force)))
-
-    def _placed(self, body: str) -> Array:
-        if body in self._index:
-            return self._X[:, self._index[body]]
-        return np.broadcast_to(np.eye(4), (len(self._q), 4, 4))
+        X = self._dyn.pose(self._q, name)
+        R = X[:, :3, :3] if axes == LOCAL else np.eye(3)
+        point = X[:, :3, 3] if axes in (LOCAL, ALIGNED) else np.zeros(3)
+        self._push(self._model.frame(name).body, _times(R, wrench[..., :3]), _times(R, wrench[..., 3:]), point)
 
     def stretch(self, spring: PointSpring) -> None:
         """Add the pull of a spring to the bodies at its ends."""
-        ends, speeds = [], []
-        for body, point in ((spring.body_a, spring.point_a), (spring.body_b, spring.point_b)):
-            if body not in self._index:
-                ends.append(np.broadcast_to(point, (len(self._q), 3)))
-                speeds.append(np.zeros((len(self._q), 3)))
-                continue
-            X, V = self._X[:, self._index[body]], self._dyn.velocity(self._q, self._v, body)
-            ends.append(X[:, :3, 3] + _times(X[:, :3, :3], point))
-            # It is that of the frame of the body's name, which may be another one than its own.
-            speeds.append(V[:, :3] + np.cross(V[:, 3:], ends[-1] - self._dyn.pose(self._q, body)[:, :3, 3]))
-        gap, rate = ends[1] - ends[0], speeds[1] - speeds[0]
-        on_first = pull(spring, gap, rate)
-        for sign, body, point in ((1, spring.body_a, spring.point_a), (-1, spring.body_b, spring.point_b)):
+        bodies = spring.body_a, spring.body_b
+        ends = [self._placed(*end)[1] for end in zip(bodies, (spring.point_a, spring.point_b), strict=True)]
+        speeds = [np.zeros((len(self._q), 3)) for _ in ends]
+        for k, body in enumerate(bodies):
             if body in self._index:
-                force = sign * _times(self._rotation(body).swapaxes(1, 2), on_first)
-                self._add(body, force, np.cross(point, force))
+                # It is that of the frame of the body's name, which may be another one than its own.
+                V = self._dyn.velocity(self._q, self._v, body)
+                speeds[k] = V[:, :3] + np.cross(V[:, 3:], ends[k] - self._dyn.pose(self._q, body)[:, :3, 3])
+        on_first = pull(spring, ends[1] - ends[0], speeds[1] - speeds[0])
+        for sign, body, end in zip((1, -1), bodies, ends, strict=True):
+            self._push(body, sign * on_first, 0.0, end)
 
     def residual(self) -> Array:
         """Return forces and moments less the rates of momentum: the residual of the balance."""
@@ -372,7 +341,8 @@ class _Balance:
         linear, angular = _times(turn, local[..., :3]), _times(turn, local[..., 3:])
         w = _times(turn, dyn.velocity(self._q, self._v, self._names, LOCAL)[..., 3:])
         own = linear + np.cross(angular, arm) + np.cross(w, np.cross(w, arm))
+        force, moment = _times(R, self._force), _times(R, self._moment)
         weight = np.array([b.mass for b in bodies])[:, None] * _times(R, self._model.gravity)
         # Gravity acts at the centre of mass.
-        acting = np.concatenate([self._force + weight, self._moment - np.cross(com, self._force)], axis=-1)
+        acting = np.concatenate([force + weight, moment - np.cross(com, force)], axis=-1)
         return np.asarray(acting - momentum_rates(bodies, w, np.concatenate([own, angular], axis=-1)))

@@ -25,19 +25,16 @@ from mbkit._check import Array
 from mbkit.codegen.backend import LastUsed
 from mbkit.codegen.extended_precision import Backend, Extended, arithmetic, digits, product, solve
 from mbkit.codegen.program import program
-from mbkit.derivation import FUNCTIONS, equations_of
+from mbkit.derivation import equations_of
 from mbkit.derivation.body_motion import BODY_QUANTITIES
-from mbkit.derivation.constraints import CONSTRAINT_FUNCTIONS
-from mbkit.engines.base import DERIVATION, Dynamics, scalar
-from mbkit.engines.linearization import of_parameters, of_second_order
+from mbkit.engines.lagrangian import WRITTEN, Derived, function_of, names_of
 from mbkit.errors import InputError, UnknownNameError
-from mbkit.model import Frame, Joint, Model
+from mbkit.model import Frame, Model
 from mbkit.model.quantities import QUANTITIES
 
 #: Quantity -> its arguments, as in `Dynamics`.
-_WRITTEN: Final = FUNCTIONS | CONSTRAINT_FUNCTIONS
 _ARGUMENTS: Final = {
-    name: tuple(x for x in QUANTITIES[name].arguments if x != "wrenches") for name in (*_WRITTEN, *BODY_QUANTITIES)
+    name: tuple(x for x in QUANTITIES[name].arguments if x != "wrenches") for name in (*WRITTEN, *BODY_QUANTITIES)
 }
 #: Terms that one function gives together, in this order.
 _TERMS: Final = ("mass_matrix", "coriolis_force", "gravity", "passive", "nle")
@@ -64,8 +61,7 @@ def _of_shape(name: str) -> Callable[..., Any]:
 
     def evaluate(self: OracleDynamics, *given: Any) -> Any:
         n = sum(isinstance(x, np.ndarray) for x in given[: len(QUANTITIES[name].arguments)])
-        extra = (tuple(x.name for x in e) if isinstance(e, tuple) else e for e in given[n:])
-        out = self._run((name, *extra), *given[:n])
+        out = self._run((name, *map(names_of, given[n:])), *given[:n])
         if len(shape) < 3:
             return out[0] if len(shape) == 2 else out[0][:, :, 0] if shape else out[0][:, 0, 0]
         if not of_bodies:
@@ -76,7 +72,7 @@ def _of_shape(name: str) -> Callable[..., Any]:
     return evaluate
 
 
-class OracleDynamics(Dynamics):
+class OracleDynamics(Derived):
     """Terms with 34 digits. The methods of `Dynamics` round them once, to double.
 
     Parameters
@@ -96,10 +92,6 @@ class OracleDynamics(Dynamics):
 
     engine = "oracle"
     _significand_bits = 113
-    _has_force_elements = True
-    _one_at_a_time = False
-    _path = DERIVATION
-    _why_no_derivatives = ""
     _refuses: ClassVar = {"function": "a casadi.Function computes in double; the lagrangian engine gives it"}
 
     def __init__(
@@ -163,10 +155,6 @@ class OracleDynamics(Dynamics):
         """Return a quantity as an array of mpmath's numbers of 113 bits, to read them; arguments as of `extended`."""
         return digits(self._exact(quantity, arguments), self._arithmetic)
 
-    def energy_rate(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Any:
-        """Return dE/dt of kinetic and potential energy along (D v, a), exactly differentiated."""
-        return scalar(self._evaluate("energy_rate", q=q, v=v, a=a))
-
     def at(self, /, **values: float) -> OracleDynamics:
         """Return the same dynamics at other values of the model's named parameters."""
         if self._given is not None:
@@ -188,7 +176,7 @@ class OracleDynamics(Dynamics):
         return np.asarray(self._arithmetic.pair(value)[0])
 
     def _under(self, frames: tuple[Frame, ...], axes: str) -> OracleDynamics:
-        key = tuple(frame.name for frame in frames), axes
+        key = names_of(frames), axes
         kept: dict[Any, OracleDynamics] = self.equations.kept.setdefault("under", {})
         if key not in kept:
             own = kept[key] = copy(self)
@@ -236,12 +224,13 @@ class OracleDynamics(Dynamics):
             )
         return self._programs[name](self._normalized(q), *arguments, *self._constants)
 
+    def _first(self, name: str, *states: Any, extra: tuple[Any, ...] = ()) -> Any:
+        return self._run((name, *extra), *states)[0]
+
     def _function_of(self, name: str, *extra: Any) -> ca.Function:
         eq = self.equations
         if name != "terms":
-            if name in BODY_QUANTITIES:
-                return eq.body_quantity(name, *extra)
-            return eq.function(name) if name in _WRITTEN else getattr(eq, name)(*extra)
+            return function_of(eq, name, *extra)
         outs = [ca.densify(getattr(eq, x)) for x in _TERMS]
         return ca.Function("terms", [eq.q, eq.v, *eq.extra_arguments.values()], outs)
 
@@ -283,28 +272,6 @@ class OracleDynamics(Dynamics):
         M, own = self._terms(q)["mass_matrix"], self._arithmetic
         unit = own.array(np.broadcast_to(np.eye(self.model.nv), M.shape))
         return solve(M, unit, self._pattern, self.equations.elimination_order, own)
-
-    def _inverse_dynamics_second_derivatives(self, *states: Array) -> Any:
-        return of_second_order(self._run(("inverse_dynamics_second_derivatives",), *states)[0])
-
-    def _parameter_derivatives(self, quantity: str, *states: Array) -> Any:
-        return of_parameters(self.model, quantity, self._run(("parameter_derivatives", quantity), *states)[0])
-
-    def _actuator_forces(self, q: Array, v: Array, a: Array, actuators: tuple[Joint, ...]) -> Any:
-        which = self._moved_by(actuators)
-        out = self._run(("actuator_forces", which), q, v, a)[0][:, :, 0]
-        return self._judged(out, q, a, which)
-
-    def _loads_of_motion(self, q: Array, v: Array, a: Array, tau: Array, *given: Any) -> Any:
-        return self._loads(False, q, v, a, tau, *given)
-
-    def _loads_under_force(self, q: Array, v: Array, tau: Array, *given: Any) -> Any:
-        return self._loads(True, q, v, tau, *given)
-
-    def _loads(self, moved: bool, *given: Any) -> Any:
-        *states, joints, frames, axes = given
-        joints, frames = (tuple(x.name for x in parts) for parts in (joints, frames))
-        return self._run(("loads", joints, frames, axes, moved), *states)[0]
 
     def _only(self, out: Array, first: int, last: int) -> Array:
         self._values.last = self._values.last[:, first:last]
