@@ -16,6 +16,7 @@ import numpy as np
 from mbkit._check import Array, needed
 from mbkit.codegen.program import Program
 from mbkit.errors import InputError, UnsupportedError
+from mbkit.model.elements.formula import completed
 
 Backend = Literal["real128", "mpmath"]
 BINARY128_BITS: Final = 113
@@ -224,35 +225,7 @@ class Extended:
 
 
 def _functions(own: Arithmetic) -> dict[str, Callable[..., Any]]:
-    zero, one = own.array(np.zeros(1)), own.array(np.ones(1))
-
-    def truth(holds: Any) -> Any:
-        return np.where(holds, one, zero)
-
-    return {
-        **own.functions,
-        "add": np.add,
-        "sub": np.subtract,
-        "mul": np.multiply,
-        "div": own.divide,
-        "neg": np.negative,
-        "sq": lambda x: x * x,
-        "twice": lambda x: x + x,
-        "inv": lambda x: own.divide(one, x),
-        "hypot": lambda a, b: own.sqrt(a * a + b * b),
-        "fabs": lambda x: np.where(x < zero, -x, x),
-        "sign": lambda x: np.where(x > zero, one, np.where(x < zero, -one, x)),
-        "fmin": lambda a, b: np.where((a < b) | (a != a), a, b),
-        "fmax": lambda a, b: np.where((a > b) | (a != a), a, b),
-        "lt": lambda a, b: truth(a < b),
-        "le": lambda a, b: truth(a <= b),
-        "eq": lambda a, b: truth(a == b),
-        "ne": lambda a, b: truth(a != b),
-        "not": lambda a: truth(a == zero),
-        "and": lambda a, b: truth((a != zero) & (b != zero)),
-        "or": lambda a, b: truth((a != zero) | (b != zero)),
-        "if_else_zero": lambda a, b: np.where(a != zero, b, zero),
-    }
+    return completed({**own.functions, "div": own.divide}, lambda x: own.array(np.full(1, x)))
 
 
 # Solve M a = f in extended precision, for all states at once.

@@ -5,11 +5,13 @@ from __future__ import annotations
 import itertools
 import struct
 from collections.abc import Callable
+from functools import cached_property, partial
 from typing import Final
 
 import mpmath
 
 from mbkit.codegen.program import Program
+from mbkit.model.elements.formula import completed
 
 
 def _hex(x: float) -> str:
@@ -77,6 +79,21 @@ class Text:
     def select(self, which: str, yes: str, no: str) -> str:
         """Append a choice of each lane by its bit."""
         return self.put(f"select <{self.width} x i1> {which}, {self.vector} {yes}, {self.vector} {no}")
+
+    @cached_property
+    def operations(self) -> dict[str, Callable[..., str]]:
+        """What appends each operation of a program that is no call, and returns the name of its result."""
+        compared = {"lt": "olt", "le": "ole", "eq": "oeq", "ne": "une"}
+        conditions = {name: partial(self.compare, how) for name, how in compared.items()}
+        conditions |= {name: partial(self.bits, name) for name in ("and", "or")}
+        own: dict[str, Callable[..., str]] = {
+            name: partial(self.op, f"f{name}") for name in ("add", "sub", "mul", "div")
+        }
+        own |= {name: partial(self.call, name) for name in ("sqrt", "fabs")}
+        own |= {"neg": self.neg, "fma": self.fma}
+        own["fms"] = lambda a, b, c: self.fma(a, b, self.neg(c))
+        own["fnma"] = lambda a, b, c: self.fma(self.neg(a), b, c)
+        return completed(own, number, self.select, conditions)
 
 
 # Sine and cosine of a whole vector.
@@ -353,55 +370,3 @@ define internal {V} @mbkit_{name}({parameters}) noinline {attributes} {{
   ret {V} {result}
 }}
 """
-
-
-# Operations of a program that are no calls.
-
-_ZERO: Final = number(0.0)
-_ONE: Final = number(1.0)
-_Operation = Callable[..., str]
-
-
-def _plain(instruction: str) -> _Operation:
-    return lambda t, a, b: t.op(instruction, a, b)
-
-
-def _comparison(how: str) -> _Operation:
-    return lambda t, a, b: t.select(t.compare(how, a, b), _ONE, _ZERO)
-
-
-def _logical(how: str) -> _Operation:
-    return lambda t, a, b: t.select(t.bits(how, t.compare("une", a, _ZERO), t.compare("une", b, _ZERO)), _ONE, _ZERO)
-
-
-def _least(how: str) -> _Operation:
-    # NaN is propagated.
-    return lambda t, a, b: t.select(t.bits("or", t.compare(how, a, b), t.compare("uno", a, a)), a, b)
-
-
-def _sign(t: Text, a: str) -> str:
-    negative = t.select(t.compare("olt", a, _ZERO), number(-1.0), a)
-    return t.select(t.compare("ogt", a, _ZERO), _ONE, negative)
-
-
-#: Operation -> function that appends it to a text, and returns the name of its result.
-OPERATIONS: Final[dict[str, _Operation]] = {
-    **{name: _plain(f"f{name}") for name in ("add", "sub", "mul", "div")},
-    **{name: _comparison(how) for name, how in (("lt", "olt"), ("le", "ole"), ("eq", "oeq"), ("ne", "une"))},
-    "and": _logical("and"),
-    "or": _logical("or"),
-    "fmin": _least("olt"),
-    "fmax": _least("ogt"),
-    "sq": lambda t, a: t.op("fmul", a, a),
-    "twice": lambda t, a: t.op("fadd", a, a),
-    "fma": Text.fma,
-    "fms": lambda t, a, b, c: t.fma(a, b, t.neg(c)),
-    "fnma": lambda t, a, b, c: t.fma(t.neg(a), b, c),
-    "inv": lambda t, a: t.op("fdiv", _ONE, a),
-    "neg": Text.neg,
-    "sqrt": lambda t, a: t.call("sqrt", a),
-    "fabs": lambda t, a: t.call("fabs", a),
-    "sign": _sign,
-    "not": lambda t, a: t.select(t.compare("oeq", a, _ZERO), _ONE, _ZERO),
-    "if_else_zero": lambda t, a, b: t.select(t.compare("une", a, _ZERO), b, _ZERO),
-}

@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 
 from mbkit._check import by_key
-from mbkit.codegen.llvm_ir import CALLS, OPERATIONS, Text, call, declarations, library, number
+from mbkit.codegen.llvm_ir import CALLS, Text, call, declarations, library, number
 from mbkit.codegen.program import Program
 
 BODY: Final = "mbkit_body"
@@ -231,7 +231,7 @@ class Piece:
             if x not in self._pairs:
                 self._pairs[x] = t.put(f"call {pair} @mbkit_sincos({t.vector} {a[0]})")
             return t.put(f"extractvalue {pair} {self._pairs[x]}, {int(o.name == 'cos')}")
-        return call(t, o.name, a) if o.name in CALLS else OPERATIONS[o.name](t, *a)
+        return call(t, o.name, a) if o.name in CALLS else t.operations[o.name](*a)
 
     def function(self, name: str, linkage: str = "internal") -> str:
         """Return this piece's text."""

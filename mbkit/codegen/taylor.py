@@ -12,6 +12,7 @@ is then a constant of the exact flow, and what it drifts by never bends the moti
 from __future__ import annotations
 
 import math
+import operator
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,6 +28,7 @@ from mbkit.codegen.program import Operation, Program, program
 from mbkit.derivation.equations import Equations, kept
 from mbkit.derivation.mass_matrix_solve import elimination_size
 from mbkit.errors import UnsupportedError
+from mbkit.model.elements.formula import completed
 from mbkit.model.rolling import discs_of
 
 # A compiler's time for more is no longer spent unasked: 34,000 operations take 9 s.
@@ -227,31 +229,11 @@ def taylor_system(equations: Equations) -> TaylorSystem:
 
 
 def _functions(heyoka: Any) -> dict[str, Any]:
-    zero, one = heyoka.expression(0.0), heyoka.expression(1.0)
-    select, below, other = heyoka.select, heyoka.lt, heyoka.neq
-    either, both = heyoka.logical_or, heyoka.logical_and
-    return {
-        **{name: getattr(heyoka, name) for name in _SAME},
-        "add": lambda a, b: a + b,
-        "sub": lambda a, b: a - b,
-        "mul": lambda a, b: a * b,
-        "div": lambda a, b: a / b,
-        "neg": lambda a: -a,
-        "sq": lambda a: a * a,
-        "twice": lambda a: 2.0 * a,
-        "inv": lambda a: one / a,
-        "pow": lambda a, b: a**b,
-        "hypot": lambda a, b: heyoka.sqrt(a * a + b * b),
-        "fabs": lambda a: select(below(a, zero), -a, a),
-        "sign": lambda a: select(below(a, zero), -one, select(below(zero, a), one, zero)),
-        "fmin": lambda a, b: select(either([below(a, b), other(a, a)]), a, b),
-        "fmax": lambda a, b: select(either([below(b, a), other(a, a)]), a, b),
-        "lt": below,
-        "le": heyoka.lte,
-        "eq": heyoka.eq,
-        "ne": other,
-        "not": lambda a: heyoka.eq(a, zero),
-        "and": lambda a, b: both([other(a, zero), other(b, zero)]),
-        "or": lambda a, b: either([other(a, zero), other(b, zero)]),
-        "if_else_zero": lambda a, b: select(other(a, zero), b, zero),
-    }
+    zero, one, select = heyoka.expression(0.0), heyoka.expression(1.0), heyoka.select
+    compared = {"lt": heyoka.lt, "le": heyoka.lte, "eq": heyoka.eq, "ne": heyoka.neq}
+    joined = {"and": lambda *x: heyoka.logical_and([*x]), "or": lambda *x: heyoka.logical_or([*x])}
+    own = {name: getattr(heyoka, name) for name in _SAME} | compared
+    own["pow"] = operator.pow
+    # At zero a series goes on with none of the argument's.
+    own["sign"] = lambda a: select(heyoka.lt(a, zero), -one, select(heyoka.lt(zero, a), one, zero))
+    return completed(own, heyoka.expression, select, compared | joined)

@@ -9,17 +9,17 @@ import sympy as sp
 
 from mbkit.lagrangian.description_kinematics import SymbolicKinematics, exact, read_angle
 from mbkit.model.elements.forces import RATE, TIME, JointElement
-from mbkit.model.elements.formula import Arithmetic
+from mbkit.model.elements.formula import Arithmetic, completed
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion
 from mbkit.model.parts import Prescribed
 
 
-def _decided(holds: Any) -> Any:
-    return sp.Piecewise((1, holds), (0, True))
+def _select(holds: Any, yes: Any, no: Any) -> Any:
+    return sp.Piecewise((yes, holds), (no, True))
 
 
 def _condition(x: Any) -> Any:
-    """Return what makes a decision of 1 or 0 true; one that `_decided` has made is read back."""
+    """Return what makes a decision of 1 or 0 true; one that is a choice of these is read back."""
     x = sp.sympify(x)
     if isinstance(x, sp.Piecewise) and x.args[0][0] == 1 and len(x.args) == 2:
         return x.args[0][1]
@@ -31,35 +31,27 @@ def _same(name: str) -> Callable[..., Any]:
 
 
 _SAME_NAME: Final = "sqrt sin cos tan asin acos atan exp log sinh cosh tanh asinh acosh atanh atan2 sign"
+_CONDITIONS: Final = {"lt": sp.Lt, "le": sp.Le, "eq": sp.Eq, "ne": sp.Ne, "and": sp.And, "or": sp.Or}
 #: The operations of formulas in SymPy, on the decimals that were written.
 SYMPY: Final = Arithmetic(
     exact,
-    {
-        **{name: _same(name) for name in _SAME_NAME.split()},
-        "neg": lambda x: -x,
-        "sq": lambda x: x * x,
-        "twice": lambda x: 2 * x,
-        "inv": lambda x: 1 / sp.sympify(x),
-        "fabs": _same("Abs"),
-        "expm1": lambda x: sp.exp(x) - 1,
-        "log1p": lambda x: sp.log(1 + x),
-        "add": lambda a, b: a + b,
-        "sub": lambda a, b: a - b,
-        "mul": lambda a, b: a * b,
-        "div": lambda a, b: sp.sympify(a) / b,
-        "pow": lambda a, b: sp.sympify(a) ** b,
-        "hypot": lambda a, b: sp.sqrt(a**2 + b**2),
-        "fmin": _same("Min"),
-        "fmax": _same("Max"),
-        "lt": lambda a, b: _decided(sp.Lt(a, b)),
-        "le": lambda a, b: _decided(sp.Le(a, b)),
-        "eq": lambda a, b: _decided(sp.Eq(a, b)),
-        "ne": lambda a, b: _decided(sp.Ne(a, b)),
-        "not": lambda x: _decided(sp.Not(_condition(x))),
-        "and": lambda a, b: _decided(sp.And(_condition(a), _condition(b))),
-        "or": lambda a, b: _decided(sp.Or(_condition(a), _condition(b))),
-        "if_else_zero": lambda a, b: sp.Piecewise((b, _condition(a)), (0, True)),
-    },
+    completed(
+        {
+            **{name: _same(name) for name in _SAME_NAME.split()},
+            "fabs": _same("Abs"),
+            "fmin": _same("Min"),
+            "fmax": _same("Max"),
+            "expm1": lambda x: sp.exp(x) - 1,
+            "log1p": lambda x: sp.log(1 + x),
+            "div": lambda a, b: sp.sympify(a) / b,
+            "pow": lambda a, b: sp.sympify(a) ** b,
+            "not": lambda x: _select(sp.Not(_condition(x)), 1, 0),
+        },
+        sp.Integer,
+        _select,
+        _CONDITIONS,
+        _condition,
+    ),
 )
 
 

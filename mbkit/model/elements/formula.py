@@ -6,6 +6,7 @@ reads their expressions into formulas, and the derivation, SymPy and NumPy each 
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partialmethod
@@ -111,34 +112,61 @@ class Arithmetic:
     operations: Mapping[str, Callable[..., Any]]
 
 
+#: What an arithmetic compares and joins conditions by, unless it has its own.
+_CONDITIONS: Final[dict[str, Callable[..., Any]]] = {
+    **{name: getattr(operator, name) for name in ("lt", "le", "eq", "ne")},
+    "and": operator.and_,
+    "or": operator.or_,
+}
+
+
+def completed(
+    own: Mapping[str, Callable[..., Any]],
+    number: Callable[[float], Any] = float,
+    select: Callable[[Any, Any, Any], Any] = np.where,
+    conditions: Mapping[str, Callable[..., Any]] = _CONDITIONS,
+    holds: Callable[[Any], Any] | None = None,
+) -> dict[str, Callable[..., Any]]:
+    """Return all operations: an arithmetic's own ones, and what the others mean by those.
+
+    `select` chooses between two numbers by a condition, and `holds` is that of a decision of 1 or 0. fmin and fmax
+    propagate NaN, which counts as true.
+    """
+    zero, one, of = number(0.0), number(1.0), conditions
+    plain = {name: getattr(operator, name) for name in ("add", "sub", "mul", "neg")} | {"div": operator.truediv}
+    plain |= {name: own[name] for name in plain.keys() & own.keys()}
+    true = holds or (lambda x: of["ne"](x, zero))
+
+    def decided(name: str, read: Callable[[Any], Any] = lambda x: x) -> Callable[..., Any]:
+        return lambda a, b: select(of[name](read(a), read(b)), one, zero)
+
+    return {
+        **plain,
+        "sq": lambda x: plain["mul"](x, x),
+        "twice": lambda x: plain["add"](x, x),
+        "inv": lambda x: plain["div"](one, x),
+        "hypot": lambda a, b: own["sqrt"](a * a + b * b),
+        "fabs": lambda x: select(of["lt"](x, zero), plain["neg"](x), x),
+        "sign": lambda x: select(of["lt"](zero, x), one, select(of["lt"](x, zero), number(-1.0), x)),
+        "fmin": lambda a, b: select(of["or"](of["lt"](a, b), of["ne"](a, a)), a, b),
+        "fmax": lambda a, b: select(of["or"](of["lt"](b, a), of["ne"](a, a)), a, b),
+        **{name: decided(name) for name in ("lt", "le", "eq", "ne")},
+        "not": lambda x: select(true(x), zero, one),
+        **{name: decided(name, true) for name in ("and", "or")},
+        "if_else_zero": lambda a, b: select(true(a), b, zero),
+        **own,
+    }
+
+
+_SAME: Final = ("sign", "sqrt", "sin", "cos", "tan", "exp", "expm1", "log", "log1p", "sinh", "cosh", "tanh", "hypot")
+_INVERSE: Final = ("asin", "acos", "atan", "asinh", "acosh", "atanh", "atan2")
+_FUNCTIONS: Final[dict[str, Callable[..., Any]]] = {
+    **{name: getattr(np, name) for name in _SAME},
+    **{name: getattr(np, name.replace("a", "arc", 1)) for name in _INVERSE},
+    "fabs": np.abs,
+    "pow": np.power,
+    "fmin": np.minimum,
+    "fmax": np.maximum,
+}
 #: On floats and NumPy arrays.
-NUMPY: Final = Arithmetic(
-    float,
-    {
-        "neg": lambda x: -x,
-        "sq": lambda x: x * x,
-        "twice": lambda x: x + x,
-        "inv": lambda x: 1.0 / x,
-        "fabs": np.abs,
-        "not": lambda x: 1.0 * (x == 0),
-        **{n: getattr(np, n) for n in ("sign", "sqrt", "sin", "cos", "tan", "exp", "expm1", "log", "log1p")},
-        **{n: getattr(np, n) for n in ("sinh", "cosh", "tanh", "hypot")},
-        **{n: getattr(np, n.replace("a", "arc", 1)) for n in ("asin", "acos", "atan", "asinh", "acosh", "atanh")},
-        "add": lambda a, b: a + b,
-        "sub": lambda a, b: a - b,
-        "mul": lambda a, b: a * b,
-        "div": lambda a, b: a / b,
-        "pow": np.power,
-        "atan2": np.arctan2,
-        # These propagate NaN, as the compiled ones do.
-        "fmin": np.minimum,
-        "fmax": np.maximum,
-        "lt": lambda a, b: 1.0 * (a < b),
-        "le": lambda a, b: 1.0 * (a <= b),
-        "eq": lambda a, b: 1.0 * (a == b),
-        "ne": lambda a, b: 1.0 * (a != b),
-        "and": lambda a, b: 1.0 * np.logical_and(a, b),
-        "or": lambda a, b: 1.0 * np.logical_or(a, b),
-        "if_else_zero": lambda a, b: np.where(a, b, 0.0),
-    },
-)
+NUMPY: Final = Arithmetic(float, completed(_FUNCTIONS, select=lambda holds, yes, no: np.where(holds, yes, no)[()]))
