@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
-
+from mbkit.catalog._links import TURN, X, Z
 from mbkit.catalog._system import Vector, down, moments, nonnegative, system
 from mbkit.model import Model, ModelBuilder, Number, known, nominal
 
@@ -18,11 +17,6 @@ __all__ = [
     "slider_crank",
     "spherical_pendulum",
 ]
-
-#: Axis of planar hinges: a positive turn about -y swings what hangs down towards +x.
-_SWING: Final = (0.0, -1.0, 0.0)
-_X: Final = (1.0, 0.0, 0.0)
-_Z: Final = (0.0, 0.0, 1.0)
 
 
 @system
@@ -39,7 +33,7 @@ def pendulum(*, length: Number = 1.0, mass: Number = 1.0, gravity: Number = 9.81
     """
     b = ModelBuilder("pendulum", gravity=down(gravity))
     b.add_body("bob", mass=mass, com=(0.0, 0.0, -length))
-    b.add_joint("theta", "continuous", parent="world", child="bob", axis=_SWING)
+    b.add_joint("theta", "continuous", parent="world", child="bob", axis=TURN)
     b.add_frame("tip", body="bob", translation=(0.0, 0.0, -length))
     return b.build()
 
@@ -61,8 +55,8 @@ def double_pendulum(
     b = ModelBuilder("double_pendulum", gravity=down(gravity))
     b.add_body("rod1", mass=mass1, com=(0.0, 0.0, -length1))
     b.add_body("rod2", mass=mass2, com=(0.0, 0.0, -length2))
-    b.add_joint("theta1", "continuous", parent="world", child="rod1", axis=_SWING)
-    b.add_joint("theta2", "continuous", parent="rod1", child="rod2", axis=_SWING, translation=(0.0, 0.0, -length1))
+    b.add_joint("theta1", "continuous", parent="world", child="rod1", axis=TURN)
+    b.add_joint("theta2", "continuous", parent="rod1", child="rod2", axis=TURN, translation=(0.0, 0.0, -length1))
     b.add_frame("tip", body="rod2", translation=(0.0, 0.0, -length2))
     return b.build()
 
@@ -84,8 +78,8 @@ def cart_pole(
     b = ModelBuilder("cart_pole", gravity=down(gravity))
     b.add_body("cart", mass=cart_mass)
     b.add_body("pole", mass=pole_mass, com=(0.0, 0.0, -length))
-    b.add_joint("x", "prismatic", parent="world", child="cart", axis=_X)
-    b.add_joint("theta", "continuous", parent="cart", child="pole", axis=_SWING)
+    b.add_joint("x", "prismatic", parent="world", child="cart", axis=X)
+    b.add_joint("theta", "continuous", parent="cart", child="pole", axis=TURN)
     b.add_frame("tip", body="pole", translation=(0.0, 0.0, -length))
     return b.build()
 
@@ -112,8 +106,8 @@ def spherical_pendulum(*, length: Number = 1.0, mass: Number = 1.0, gravity: Num
     b = ModelBuilder("spherical_pendulum", gravity=down(gravity))
     b.add_body("fork", mass=0.0)
     b.add_body("bob", mass=mass, com=(0.0, 0.0, -length))
-    b.add_joint("alpha", "continuous", parent="world", child="fork", axis=_SWING)
-    b.add_joint("beta", "continuous", parent="fork", child="bob", axis=_X)
+    b.add_joint("alpha", "continuous", parent="world", child="fork", axis=TURN)
+    b.add_joint("beta", "continuous", parent="fork", child="bob", axis=X)
     b.add_frame("tip", body="bob", translation=(0.0, 0.0, -length))
     return b.build()
 
@@ -139,7 +133,7 @@ def elastic_pendulum(
     b = ModelBuilder("elastic_pendulum", gravity=down(gravity))
     b.add_body("rod", mass=0.0)
     b.add_body("bob", mass=mass, com=(0.0, 0.0, -length))
-    b.add_joint("theta", "continuous", parent="world", child="rod", axis=_SWING)
+    b.add_joint("theta", "continuous", parent="world", child="rod", axis=TURN)
     b.add_joint(
         "stretch", "prismatic", parent="rod", child="bob", axis=(0.0, 0.0, -1.0), lower=lower, stiffness=stiffness
     )
@@ -175,8 +169,8 @@ def acrobot(
     b = ModelBuilder("acrobot", gravity=down(gravity))
     b.add_body("link1", mass=mass1, com=(0.0, 0.0, -com1), inertia=(inertia1, inertia1, 0.0))
     b.add_body("link2", mass=mass2, com=(0.0, 0.0, -com2), inertia=(inertia2, inertia2, 0.0))
-    b.add_joint("theta1", "continuous", parent="world", child="link1", axis=_SWING)
-    b.add_joint("theta2", "continuous", parent="link1", child="link2", axis=_SWING, translation=(0.0, 0.0, -length1))
+    b.add_joint("theta1", "continuous", parent="world", child="link1", axis=TURN)
+    b.add_joint("theta2", "continuous", parent="link1", child="link2", axis=TURN, translation=(0.0, 0.0, -length1))
     b.add_frame("tip", body="link2", translation=(0.0, 0.0, -length2))
     return b.build()
 
@@ -210,9 +204,9 @@ def furuta_pendulum(
     b = ModelBuilder("furuta_pendulum", gravity=down(gravity))
     b.add_body("arm body", mass=arm_mass, com=(arm_com, 0.0, 0.0), inertia=(0.0, arm_inertia, arm_inertia))
     b.add_body("pendulum body", mass=pendulum_mass, com=(0.0, 0.0, -pendulum_com), inertia=pendulum_inertia)
-    b.add_joint("arm", "continuous", parent="world", child="arm body", axis=_Z)
+    b.add_joint("arm", "continuous", parent="world", child="arm body", axis=Z)
     end = (arm_length, 0.0, 0.0)
-    b.add_joint("pendulum", "continuous", parent="arm body", child="pendulum body", axis=_X, translation=end)
+    b.add_joint("pendulum", "continuous", parent="arm body", child="pendulum body", axis=X, translation=end)
     return b.build()
 
 
@@ -234,7 +228,7 @@ def chain(*, n: int = 5, length: Number = 1.0, mass: Number = 1.0, gravity: Numb
     for i in range(1, n + 1):
         parent, top = (f"rod{i - 1}", (0.0, 0.0, -length)) if i > 1 else ("world", (0.0, 0.0, 0.0))
         b.add_body(f"rod{i}", mass=mass, com=(0.0, 0.0, -length / 2), inertia=(across, across, 0.0))
-        b.add_joint(f"theta{i}", "continuous", parent=parent, child=f"rod{i}", axis=_SWING, translation=top)
+        b.add_joint(f"theta{i}", "continuous", parent=parent, child=f"rod{i}", axis=TURN, translation=top)
     b.add_frame("tip", body=f"rod{n}", translation=(0.0, 0.0, -length))
     return b.build()
 
@@ -272,8 +266,8 @@ def slider_crank(
         across = mass * length**2 / 12
         b.add_body(name, mass=mass, com=(length / 2, 0.0, 0.0), inertia=(0.0, across, across))
     b.add_body("piston", mass=piston_mass)
-    b.add_joint("theta", "continuous", parent="world", child="crank", axis=_Z)
-    b.add_joint("phi", "continuous", parent="crank", child="rod", axis=_Z, translation=(crank, 0.0, 0.0))
-    b.add_joint("x", "prismatic", parent="world", child="piston", axis=_X, translation=(crank + rod, 0.0, 0.0))
+    b.add_joint("theta", "continuous", parent="world", child="crank", axis=Z)
+    b.add_joint("phi", "continuous", parent="crank", child="rod", axis=Z, translation=(crank, 0.0, 0.0))
+    b.add_joint("x", "prismatic", parent="world", child="piston", axis=X, translation=(crank + rod, 0.0, 0.0))
     b.add_loop("pin", "point", body_a="rod", translation_a=(rod, 0.0, 0.0), body_b="piston")
     return b.build()

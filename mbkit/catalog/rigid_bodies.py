@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, finite_array, shown
+from mbkit.catalog._links import X, Y, Z
 from mbkit.catalog._system import Vector, down, lengths, moments, nonnegative, point, system
 from mbkit.errors import InputError
 from mbkit.model import Model, ModelBuilder, Number
@@ -94,9 +95,9 @@ def gyroscope(
     b.add_body("inner gimbal", mass=gimbal_mass, inertia=inner_inertia)
     rotor = moments("rotor_axial", (rotor_across, rotor_axial, rotor_across))
     b.add_body("rotor", mass=rotor_mass, com=(0.0, offset, 0.0), inertia=rotor)
-    b.add_joint("precession", "continuous", parent="world", child="outer gimbal", axis=(0.0, 0.0, 1.0))
-    b.add_joint("nutation", "continuous", parent="outer gimbal", child="inner gimbal", axis=(1.0, 0.0, 0.0))
-    b.add_joint("spin", "continuous", parent="inner gimbal", child="rotor", axis=(0.0, 1.0, 0.0))
+    b.add_joint("precession", "continuous", parent="world", child="outer gimbal", axis=Z)
+    b.add_joint("nutation", "continuous", parent="outer gimbal", child="inner gimbal", axis=X)
+    b.add_joint("spin", "continuous", parent="inner gimbal", child="rotor", axis=Y)
     return b.build()
 
 
@@ -119,9 +120,8 @@ _STUB_LENGTH_RATIO: Final = 6**-0.5
 #: Limit of a segment's turn, rad: lumping is valid below; random states stay there.
 _MAX_SEGMENT_TURN: Final = 0.2
 
-_Z: Final = (0.0, 0.0, 1.0)
 #: Half a turn about +z.
-_BACKWARDS: Final = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), _Z)
+_BACKWARDS: Final = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), Z)
 
 
 #: Number of segments; length, mass and bending stiffness of the whole beam.
@@ -145,7 +145,7 @@ def _add_beam(
             "revolute",
             parent=parent if first else f"{name} segment{i - 1}",
             child=f"{name} segment{i}",
-            axis=_Z,
+            axis=Z,
             translation=(-reach if turned else reach, 0.0, 0.0),
             rotation=_BACKWARDS if turned else None,
             stiffness=bending_stiffness / ((_STUB_LENGTH_RATIO + 0.5) * h if first else h),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from typing import Any, Final, Literal
@@ -239,7 +239,4 @@ def _fewer(shapes: list[Shape], triangles: int) -> tuple[Shape, ...]:
     uses = max(1.0, sum(len(s.meshes) for s in shapes) / max(1, len(flat)))
     fewer = iter(thinned(flat, int(triangles / uses)))
     own = {key: tuple(next(fewer) for _ in group) for key, group in meshes.items()}
-    return tuple(
-        Shape(s.name, s.body, s.rotation, s.translation, s.kind, s.size, own.get(id(s.meshes), ()), s.color)
-        for s in shapes
-    )
+    return tuple(replace(s, meshes=own.get(id(s.meshes), ())) for s in shapes)
