@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from mbkit import catalog
+from mbkit.codegen import compiled_calls
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation import Equations
 from mbkit.derivation.steps import fixed
 from mbkit.derivation.steps.collocation import Collocation
 from mbkit.derivation.steps.fixed import march, march_in_stages, velocity_changes
-from mbkit.engines import compiled_calls, dynamics
+from mbkit.engines import dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import MbkitWarning
 from mbkit.methods.registry import method_of

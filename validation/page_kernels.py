@@ -24,7 +24,7 @@ from uuid import uuid4
 _SOCKET: Final = "MBKIT_PAGE_KERNELS"
 _IMPORTED: Final = (
     *("IPython.display", "ipykernel.kernelapp", "matplotlib.pyplot", "matplotlib_inline.backend_inline", "sympy"),
-    *("mujoco", "pinocchio", "mbkit.identify", "mbkit.report", "mbkit.studies", "mbkit.engines.compiled_calls"),
+    *("mujoco", "pinocchio", "mbkit.identify", "mbkit.report", "mbkit.studies", "mbkit.codegen.compiled_calls"),
     *("mbkit.engines.mujoco", "mbkit.engines.pinocchio", "mbkit.lagrangian.system"),
 )
 

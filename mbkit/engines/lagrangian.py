@@ -14,30 +14,26 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, count, finite_array, is_on_device, on_host, real
 from mbkit.codegen.backend import DERIVING, compile_by_default, executable, has_compiler
 from mbkit.codegen.interpreter import Machine
-from mbkit.derivation import ELIMINATIONS, FUNCTIONS, Elimination, Equations, elimination_of, equations_of
+from mbkit.derivation import ELIMINATIONS, Elimination, Equations, elimination_of, equations_of
 from mbkit.derivation.body_motion import BODY_QUANTITIES
-from mbkit.derivation.constraints import CONSTRAINT_FUNCTIONS
 from mbkit.derivation.least_constraint import has_squares
-from mbkit.engines.base import DERIVATION, Dynamics, scalar
+from mbkit.engines.base import Dynamics
+from mbkit.engines.derived import Derived, function_of, names_of
 from mbkit.engines.elements.added_force import UNDER_FORCE
 from mbkit.engines.frames_and_momenta import ALIGNED
-from mbkit.engines.linearization import of_parameters, of_second_order
 from mbkit.engines.loads import Wrenches
 from mbkit.engines.steps import momentum_step_slopes
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError, require_known
 from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method
-from mbkit.model import Frame, Joint, Model
+from mbkit.model import Frame, Model
 from mbkit.model.elements.kinds import that_do
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.quantities import QUANTITIES, of_groups
 
 if TYPE_CHECKING:
+    from mbkit.codegen.compiled_calls import CompiledStep, Plan, QuantityCall
     from mbkit.codegen.cuda.runs import CudaSteps
     from mbkit.derivation.steps.fixed import Part
-    from mbkit.engines.compiled_calls import CompiledStep, Plan, QuantityCall
-
-#: Quantity -> its arguments, of those that are written in symbols.
-WRITTEN: Final = FUNCTIONS | CONSTRAINT_FUNCTIONS
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -114,11 +110,6 @@ def _term(name: str) -> Callable[..., Any]:
     return evaluate
 
 
-def names_of(value: Any) -> Any:
-    """Return the names of frames or joints, and anything else as it is."""
-    return tuple(x.name for x in value) if isinstance(value, tuple) else value
-
-
 def _body_term(name: str) -> Callable[..., Any]:
     states = BODY_QUANTITIES[name].arguments
 
@@ -128,49 +119,6 @@ def _body_term(name: str) -> Callable[..., Any]:
         return _TRIM[name](self._machine(name, *map(names_of, given[n:]))(*given[:n])[0])
 
     return evaluate
-
-
-def function_of(equations: Equations, name: str, *extra: Any) -> ca.Function:
-    """Return what the derivation has by a name, and by what stands beside it, such as names of frames."""
-    if name in BODY_QUANTITIES:
-        return equations.body_quantity(name, *extra)
-    return equations.function(name) if name in WRITTEN else getattr(equations, name)(*extra)
-
-
-class Derived(Dynamics):
-    """What engines of the own derivation have alike, in double and in more digits."""
-
-    _has_force_elements = True
-    _one_at_a_time = False
-    _path = DERIVATION
-    _why_no_derivatives = ""
-    #: Name, states, and `extra` of `function_of` -> the function's first result.
-    _first: Callable[..., Any]
-
-    def energy_rate(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Any:
-        """Return dE/dt of kinetic and potential energy along (D v, a), exactly differentiated."""
-        return scalar(self._evaluate("energy_rate", q=q, v=v, a=a))
-
-    def _actuator_forces(self, q: Array, v: Array, a: Array, actuators: tuple[Joint, ...]) -> Any:
-        which = self._moved_by(actuators)
-        out = self._first("actuator_forces", q, v, a, extra=(which,))[..., 0]
-        return self._judged(out, q, a, which)
-
-    def _loads_of_motion(self, *given: Any) -> Any:
-        return self._loads(False, *given)
-
-    def _loads_under_force(self, *given: Any) -> Any:
-        return self._loads(True, *given)
-
-    def _loads(self, moved: bool, *given: Any) -> Any:
-        *states, joints, frames, axes = given
-        return self._first("loads", *states, extra=(names_of(joints), names_of(frames), axes, moved))
-
-    def _inverse_dynamics_second_derivatives(self, *states: Array) -> Any:
-        return of_second_order(self._first("inverse_dynamics_second_derivatives", *states))
-
-    def _parameter_derivatives(self, quantity: str, *states: Array) -> Any:
-        return of_parameters(self.model, quantity, self._first("parameter_derivatives", *states, extra=(quantity,)))
 
 
 class LagrangianDynamics(Derived):
@@ -278,7 +226,7 @@ class LagrangianDynamics(Derived):
             undecided = "jump" in self.model.effects and {name, *extra} & {*UNDER_FORCE, _DERIVATIVES[1]}
             if name in _TRIM and not (isinstance(code, Machine) or undecided):
                 # Loads LLVM, which interpreting never needs.
-                from mbkit.engines.compiled_calls import quantity_call
+                from mbkit.codegen.compiled_calls import quantity_call
 
                 short = quantity_call(self.model, code, _TRIM[name], self.threads)
                 # Derivatives go by the name of what they are of.
@@ -483,7 +431,7 @@ class LagrangianDynamics(Derived):
         `thorough`: with the projection for steps that the usual one loses to their constraints; `fed`: under a state
         feedback with a gain of this pattern; `behind`: with these parts at its end.
         """
-        from mbkit.engines.compiled_calls import Plan
+        from mbkit.codegen.compiled_calls import Plan
 
         plans: dict[Any, Plan] = self.equations.kept.setdefault("rollout", {})
         key = METHODS[method].code_name, thorough, fed, *(part.name for part in behind)
@@ -493,7 +441,7 @@ class LagrangianDynamics(Derived):
 
     def _step_with(self, method: str, part: Part) -> CompiledStep:
         """Return an explicit method's step with a part at its end."""
-        from mbkit.engines.compiled_calls import CompiledStep
+        from mbkit.codegen.compiled_calls import CompiledStep
 
         steps: dict[Any, CompiledStep] = self.equations.kept.setdefault("steps", {})
         key = METHODS[method].code_name, part.name
@@ -570,7 +518,7 @@ class LagrangianDynamics(Derived):
         steps = self._thorough_steps if thorough else self._steps
         held = steps.get(method.name)
         if held is None or held[0] is not method:
-            from mbkit.engines.compiled_calls import CompiledStep
+            from mbkit.codegen.compiled_calls import CompiledStep
 
             plan = self._step_plan(method.name, thorough=thorough)
             held = steps[method.name] = method, CompiledStep(self.model, self.equations, plan, self._part)

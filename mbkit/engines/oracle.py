@@ -27,7 +27,7 @@ from mbkit.codegen.extended_precision import Backend, Extended, arithmetic, digi
 from mbkit.codegen.program import program
 from mbkit.derivation import equations_of
 from mbkit.derivation.body_motion import BODY_QUANTITIES
-from mbkit.engines.lagrangian import WRITTEN, Derived, function_of, names_of
+from mbkit.engines.derived import WRITTEN, Derived, function_of, names_of
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Frame, Model
 from mbkit.model.quantities import QUANTITIES

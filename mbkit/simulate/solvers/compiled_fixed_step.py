@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from mbkit._check import Array
 from mbkit._child_process import cores
 from mbkit.codegen.compiled import Call, KernelSequence
+from mbkit.codegen.compiled_calls import Plan
 from mbkit.derivation.steps.fixed import LAW, Part
-from mbkit.engines.compiled_calls import Plan
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import NumericalError, TorqueError
 from mbkit.methods.registry import method_of
