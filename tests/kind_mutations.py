@@ -72,7 +72,7 @@ class Mutant:
 
 
 def checks() -> dict[str, kind_paths.Any]:
-    """Return the checks of gates by name, which import every path."""
+    """Return the checks of gates without a column, which import every path."""
     from tests.test_matrix import CHECKS
 
     return CHECKS
@@ -110,7 +110,7 @@ def ends(path: str, x: Example, folder: Path, *, column: bool) -> tuple[str, str
         return out.outcome, out.text
     with warnings.catch_warnings(action="ignore"):
         try:
-            checks()[path](x.model, folder)
+            checks()[path](x)
         except kind_paths.NotAskedError:
             return "not asked", ""
         except UnsupportedError as error:

@@ -23,6 +23,7 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
+import scipy.optimize
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
@@ -33,6 +34,7 @@ from mbkit.engines.imported import reader
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.remote import environment
 from mbkit.engines.remote.packages import PACKAGES
+from mbkit.lagrangian import from_model
 from mbkit.lagrangian.printing.summary import SystemSummary, python_code
 from mbkit.model import Model
 from mbkit.model.elements.kinds import PART_KINDS
@@ -51,6 +53,7 @@ from mbkit.studies.stress.case import Case as StressCase
 from mbkit.studies.stress.measure import Limits, measure, prepare
 from mbkit.testing import assert_same_dynamics
 from tests import kind_examples
+from tests.fake_cuda import fake_gpu
 from tests.kind_examples import Example, size_of
 from tests.kind_paths import (
     CLOSE,
@@ -78,10 +81,10 @@ from tests.kind_paths import (
     registered,
     without_part,
 )
-from tests.path_checks import CHECKS, resting
-from tests.plain_mechanics import Case, derivative, rotation
+from tests.plain_mechanics import Case, Part, derivative, rotation
 from tests.test_engine_versions import present
 from tests.written_math import assigned, lines_of_latex, lines_of_text, number, plain
+from validation.gpu import on_device
 
 __all__ = ["COLUMNS", "NOT_YET", "ROWS", "cell", "registered"]
 
@@ -119,7 +122,7 @@ column("other environments", "sent as data (Drake)", "sent to drake", which="dra
 column("other environments", "sent as MJCF (MuJoCo)", which="mujoco")(_remote)
 
 
-@column("other environments", "own run there (MuJoCo)", close=1e-8)
+@column("other environments", "own run there (MuJoCo)", "mjcf", "sent", "remote runs", close=1e-8)
 def _remote_run(x: Example, folder: Path) -> Told:
     q, v = _sent(x, "mujoco").rollout(x.q, x.v, STEP, round(DURATION / STEP))
     wanted = x.state(x.flow([DURATION], lambda t, q, v: 0 * v)[-1])
@@ -521,24 +524,59 @@ def _film(x: Example, folder: Path) -> Told:
     return max(worst, off(up @ g, [0, 0, -np.linalg.norm(g)]) if g.any() else 0.0)
 
 
-# Paths with a check of their own
-
-
-def _by_check(x: Example, folder: Path, gate: str, of_rows: bool = False) -> Told:
-    if of_rows and not x.rows:
+@column("quantities", "rows of constraints", "constraint rows")
+def _rows(x: Example, folder: Path) -> Told:
+    """The rows hold at the state, and for the acceleration that they leave."""
+    if not x.rows:
         raise NotAskedError("no rows")
-    CHECKS[gate](x.model, folder)
-    return 0.0
+    dyn = engine(x.name)
+    left = dyn.constraint_jacobian(x.q) @ x.accelerated() + dyn.constraint_bias(x.q, x.v)
+    return max(off(y, 0 * y) for y in (dyn.constraint_residual(x.q), dyn.constraint_rate(x.q, x.v), left))
 
 
-for _group, _name, _gate, _of_rows in (
-    ("quantities", "rows of constraints", "constraint rows", True),
-    ("quantities", "GPU: arrays that lie there", "gpu under force", False),
-    ("engine mujoco", "mujoco: law of constraints", "constraint law", True),
-    ("changes", "independent coordinates", "embedded", True),
-    ("studies", "excitation", "excitation", False),
-):
-    column(_group, _name, _gate, gate=_gate, of_rows=_of_rows)(_by_check)
+@column("quantities", "GPU: arrays that lie there", "gpu under force")
+def _on_a_gpu(x: Example, folder: Path) -> Told:
+    """At rest dry friction is another one, which holds a part in its place."""
+    with fake_gpu():
+        dyn, worst = dynamics(x, x.model, compile=True, device="cuda"), 0.0
+        for v in (x.v, *([] if x.model.constrained else [0 * x.v])):
+            wanted = engine(x.name).forward_dynamics(x.q, v, x.tau) if v is not x.v else x.accelerated()
+            out = dyn.forward_dynamics(*(on_device(np.stack([y, y]), major=False) for y in (x.q, v, x.tau)))
+            worst = max(worst, off(out.numpy() if hasattr(out, "numpy") else out, [wanted] * 2))
+    return worst
+
+
+@column("engine mujoco", "mujoco: law of constraints", "constraint law")
+def _law(x: Example, folder: Path) -> Told:
+    if not x.rows:
+        raise NotAskedError("no rows")
+    return off(engine(x.name, "mujoco").constraint_law(x.q, x.v, x.tau).rigid, x.accelerated())
+
+
+@column("changes", "independent coordinates", "embedded", close=1e-8)
+def _embedded(x: Example, folder: Path) -> Told:
+    if not x.rows:
+        raise NotAskedError("no rows")
+    if x.model.has_bodies:
+        GATES["paper"].admit(x.model)
+        GATES["embedded"].admit(x.model)
+    if x.model.nv > 4:
+        raise NotAskedError("more than four joints take long to write")
+    lag = from_model(x.model, drives=bool(x.model.prescribed)) if x.model.has_bodies else x.model.form
+    end = x.t + DURATION
+    run = mb.simulate(lag.embedded(), x.plain.q, x.v, DURATION, "rk853", torque=x.tau, t0=x.t, save=[end])
+    return off(run.v[-1], x.state(flow(x.name))[1])
+
+
+@column("studies", "excitation", "excitation", close=1e-3)
+def _excited(x: Example, folder: Path) -> Told:
+    """The motion is one: velocities are the rates of its coordinates, and keep the rows."""
+    motion = mb.excitation(x.model, duration=2.0, harmonics=2, rate=200.0, iterations=1)
+    two = ((motion.v, motion.q), (motion.a, motion.v))
+    worst = max(off(rate[1:-1], (y[2:] - y[:-2]) / (2 * motion.t[1])) for rate, y in two)
+    rest = engine(x.name).constraint_rate(motion.q[1], motion.v[1]) if x.model.constrained else np.zeros(1)
+    return max(worst, 1e6 * off(rest, 0 * rest))
+
 
 # Studies
 
@@ -699,6 +737,42 @@ def _steady(x: Example, folder: Path) -> Told:
     return off(x.acceleration(x.t, out.q, out.v, 0 * out.v), 0 * out.v)
 
 
+def resting(x: Example) -> Example:
+    """Return an example with dry friction whose joint x rests, held by a force below its limit, while others move."""
+    c, k = x.plain, x.plain.n - (3 if x.name.endswith("several") else 1)
+    at, level = np.arange(k, c.n), 0.3 if x.name == "joint.stiction" else 0.1
+    rows = np.eye(c.n)[at]
+    held = replace(
+        c, v=np.where(np.arange(c.n) < k, 0.05 * c.v, 0.0), parts=[Part("held", (), speeds=lambda c, q: rows)]
+    )
+    out, tau = replace(x, plain=held, tau=0.05 * x.tau), 0.05 * x.tau
+    needed = replace(out, plain=replace(held, parts=[])).force(out.accelerated()) - tau
+    tau[at] += needed[at] - level
+    return replace(out, tau=tau)
+
+
+def stopping(x: Example, end: float) -> tuple[Example, np.ndarray]:
+    """Return the same, whose joint x slides to a stop within some seconds, and x and its rate at their end."""
+    rest = resting(x)
+    c, k = rest.plain, len(rest.plain.parts[0].speeds(rest.plain, rest.plain.q))
+    at = c.n - k
+    (own,) = x.plain.parts
+
+    def sliding(c: Any, t: float, q: np.ndarray, u: np.ndarray) -> Any:
+        # Of one side, so that nothing jumps.
+        return own.force(
+            c, t, q, np.where(np.arange(c.n) == at, np.maximum(u, 1e-12), np.where(np.arange(c.n) > at, 0.0, u))
+        )
+
+    parts = [Part("sliding", (), force=sliding)]
+    parts += [Part("held", (), speeds=lambda c, q: np.eye(c.n)[at + 1 :])] if k > 1 else []
+    start = replace(rest, plain=replace(c, v=c.v + 0.04 * end * np.eye(c.n)[at], parts=parts))
+    t = scipy.optimize.brentq(lambda t: start.flow([t])[-1][c.n + at], 1e-3 * end, end, xtol=1e-14)
+    q, v = np.split(start.flow([t])[-1], 2)
+    stopped = replace(c, q=q, v=np.where(np.arange(c.n) < at, v, 0.0), t=c.t + t)
+    return start, replace(rest, plain=stopped).flow([end - t])[-1]
+
+
 @column("use of runs", "at rest under dry friction", close=1e-8)
 def _sticking(x: Example, folder: Path) -> Told:
     """Joint x stays at rest while the others move: the force that holds it is below its limit, in NumPy."""
@@ -721,4 +795,8 @@ def _sticking(x: Example, folder: Path) -> Told:
             save=None,
         )
         worst = max(worst, off(run.q[-1], q1), off(run.v[-1], v1))
-    return worst
+    # And it comes to rest within a run, and stays.
+    sliding, end = stopping(x, DURATION)
+    run = mb.simulate(engine(x.name), sliding.q, sliding.v, DURATION, "rk4", STEP, torque=sliding.tau, t0=x.t)
+    q1, v1 = x.state(end)
+    return max(worst, off(run.q[-1], q1), off(run.v[-1], v1))

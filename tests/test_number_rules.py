@@ -19,10 +19,27 @@ from mbkit.model.elements.formula import Formula
 from mbkit.model.elements.kinds import PART_KINDS
 from mbkit.model.elements.references import KINDS_OF_PARTS
 from mbkit.model.parts import Mimic, NumberRule, _Frozen, acting, numbers, rules_of
-from tests.test_matrix import EXAMPLES, accelerations, example
+from tests.kind_examples import EXAMPLES
 
 #: Gravity, m/s², along -z.
 G = 9.81
+
+
+def example(name: str) -> mb.Model:
+    """Return a new model, which has not yet said what acts in it."""
+    return EXAMPLES[name](name).model
+
+
+def accelerations(dyn: mb.Dynamics, names: tuple[str, ...], closed: bool) -> np.ndarray:
+    """Return the acceleration at one state, or M and h where constraints leave a state no freedom, by joint."""
+    dyn = dyn.at(t=0.3) if dyn.model.time_parameter else dyn
+    order = [dyn.model.velocity_names.index(n) for n in names]
+    x, v, tau = np.zeros((3, dyn.model.nv))
+    x[order], v[order], tau[order] = 0.1 * np.arange(1, 1 + len(x)), 0.2 + 0.1 * np.arange(len(x)), 0.3
+    q = dyn.model.integrate(dyn.model.neutral(), x)
+    if closed:
+        return np.vstack([dyn.mass_matrix(q)[np.ix_(order, order)], dyn.nle(q, v)[order], dyn.passive(q, v)[order]])
+    return dyn.forward_dynamics(q, v, tau)[order]
 
 
 def classes_of_parts() -> set[type]:
