@@ -152,16 +152,6 @@ def test_faults_of_a_file_of_loops_are_named(file: Path, table: Path, content: s
         load(file, table)
 
 
-@pytest.mark.thorough
-def test_the_command_line_adds_loops(file: Path, table: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    arguments = ["check", str(file), "--loops", str(table), "--no-rollouts", "--samples", "2", "--json"]
-    done = CliRunner().invoke(cli, [*arguments, "--out", str(out)])
-    assert done.exit_code == 0, done.output
-    assert "holds loops softly" in done.stdout
-    assert CliRunner().invoke(cli, ["check", "pendulum", "--loops", str(table)]).exit_code == 2
-
-
 def test_a_baseline_keeps_the_file_of_loops_by_its_place(
     file: Path, table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -72,7 +72,7 @@ def without_accelerations(*_):
     raise UnsupportedError("siblings are not asked for accelerations")
 
 
-@pytest.mark.thorough(every=9)
+@pytest.mark.thorough(every=14)
 @pytest.mark.parametrize("robot", [r.name for r in mb.robots()])
 def test_robot(monkeypatch, robot):
     study = sys.modules["mbkit.studies.compare.study"]

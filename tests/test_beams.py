@@ -64,7 +64,7 @@ def same(a: sp.Expr, b: sp.Expr, symbols: list[sp.Symbol], seed: int = 5) -> boo
     return bool(np.abs(pairs[:, 0] - pairs[:, 1]).max() < 1e-12 * np.abs(pairs).max())
 
 
-@pytest.mark.thorough("0.0-3", "0.4-3")
+@pytest.mark.thorough("0.0-3", "0.4-3", "0.4-1")
 @pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize("tip", [0.0, 0.4])
 def test_energies_are_those_of_the_paper_to_second_order(count, tip):

@@ -11,7 +11,6 @@ from click.testing import CliRunner, Result
 
 import mbkit as mb
 from mbkit.cli import cli
-from mbkit.errors import OutputError
 from mbkit.studies._checkpoint import InterruptedSweepError
 from mbkit.studies.study_runs import OUT_OF_TIME
 
@@ -89,15 +88,6 @@ def test_json_and_csv_hold_the_same_points(pendulum):
 
 
 @pytest.mark.thorough
-@pytest.mark.usefixtures("here")
-def test_json_is_all_there_is_on_stdout():
-    result = call("bench", "pendulum", *SHORT, "--json", "--out", "out")
-    assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout)["model"] == "pendulum"
-    assert "pendulum-bench.html" in result.stderr
-
-
-@pytest.mark.thorough
 def test_processes_measure_too(here):
     result = call("bench", "pendulum", *SHORT, "--jobs", "1")
     assert result.exit_code == 0, result.output
@@ -130,19 +120,6 @@ def test_interrupted_before_anything_was_finished(here, monkeypatch):
     assert result.exit_code == 130
     assert "interrupted: " in result.stderr
     assert not list(here.iterdir())
-
-
-@pytest.mark.usefixtures("here")
-@pytest.mark.usefixtures("at_hand")
-def test_a_result_that_cannot_be_written_is_still_printed(monkeypatch):
-    def full(*_: object, **__: object) -> Path:
-        raise OutputError("cannot write there: No space left on device")
-
-    monkeypatch.setattr("mbkit.report.output_folder.write", full)
-    result = call("bench", "pendulum", *SHORT, "--json")
-    assert result.exit_code == 2
-    assert "No space left" in result.stderr
-    assert json.loads(result.stdout)["complete"]
 
 
 BAD = [

@@ -62,6 +62,7 @@ def spoil_all(folder, change) -> None:
         path.write_bytes(change(path.read_bytes()))
 
 
+@pytest.mark.thorough("one more", "one short", "other version", "noise")
 @pytest.mark.parametrize(
     "change",
     [

@@ -178,7 +178,7 @@ PLANTS |= {kind: in_one_part(kind) for kind in IN_ONE_PART}
 SILENT = {"limits", "joint order"}
 
 
-@pytest.mark.thorough(every=4)
+@pytest.mark.thorough(every=6)
 @pytest.mark.parametrize(
     ("plant", "name"),
     # Each mistake in two robots, each robot with eight mistakes.
@@ -822,6 +822,7 @@ def changed_fields(part: Any, model: Model) -> Iterator[tuple[str, Any]]:
             assert f.name in ("name", "kind", "child", "symbols") or x is None, f.name
 
 
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize("name", [*EXAMPLES, *TYPES])
 def test_each_field_of_each_kind_of_part_is_a_difference_that_makes_the_other(name: str) -> None:
     """With all differences applied, one description is the other: to the last field, whatever it does."""
@@ -848,7 +849,7 @@ def test_each_field_of_each_kind_of_part_is_a_difference_that_makes_the_other(na
                     assert changed is one
 
 
-@pytest.mark.thorough(every=5)
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize("name", [name for name, kind in PART_KINDS.items() if kind.features])
 def test_a_kind_that_one_side_lacks_is_the_cause(name: str) -> None:
     model = example(name).model

@@ -159,22 +159,6 @@ def test_a_removed_joint_takes_all_that_it_carries():
     assert all(x in left.notes[-1] for x in ("more0", "more1", "spring 'spring'", "coupling 'tendon'", "force 'motor'"))
 
 
-@pytest.mark.thorough
-@settings(max_examples=6, deadline=None)
-@given(SEEDS)
-def test_a_prefix_changes_names_alone(seed):
-    tree = random_tree(seed, 6, mimic=True)
-    b = mb.ModelBuilder.of(tree)
-    b.add_prefix("left_")
-    named = b.build()
-    assert named.coordinate_names == tuple(f"left_{x}" for x in tree.coordinate_names)
-    (q,), (v,), _, (tau,) = states(tree, 1, seed)
-    for term in TERMS:
-        arguments = (q,) if term in ("mass_matrix", "gravity") else (q, v)
-        assert np.array_equal(getattr(own(named), term)(*arguments), getattr(own(tree), term)(*arguments))
-    assert np.array_equal(own(named).forward_dynamics(q, v, tau), own(tree).forward_dynamics(q, v, tau))
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -380,30 +364,6 @@ def test_what_cannot_be_locked_is_refused(ask, words):
 # Join and mount
 
 
-@pytest.mark.thorough
-@settings(max_examples=6, deadline=None)
-@given(SEEDS)
-def test_two_trees_joined_have_the_arm_s_terms_in_their_block(seed):
-    base, arm = random_tree(seed, 5, kinds=SOUND), random_tree(seed + 1, 5, kinds=SOUND)
-    if any(j.parent == "world" and j.type.floating for j in arm.joints):
-        with pytest.raises(InputError, match="floats"):
-            mb.join(base, arm, at="tip", prefix="arm_")
-        return
-    whole = mb.join(base, arm, at="tip", pose=mb.spatial.pose((0.1, 0.2, 0.3), rpy=(1, 2, 3)), prefix="arm_")
-    assert whole.joint_names == (*base.joint_names, *(f"arm_{x}" for x in arm.joint_names))
-    q1, v1 = base.random_state(seed)
-    q2, v2 = arm.random_state(seed)
-    q, v = np.concatenate([q1, q2]), np.concatenate([v1, v2])
-    M = own(whole).mass_matrix(q)
-    # The arm's own block is that of the arm alone, wherever it stands, and the base's block is its own and more.
-    n = base.nv
-    assert off(M[n:, n:], own(arm).mass_matrix(q2)) < CLOSE
-    assert np.linalg.eigvalsh(M[:n, :n] - own(base).mass_matrix(q1))[0] > -1e-9 * np.abs(M).max()
-    assert off(M, mb.dynamics(whole, "pinocchio").mass_matrix(q)) < CLOSE
-    assert off(own(whole).nle(q, v), mb.dynamics(whole, "pinocchio").nle(q, v)) < CLOSE
-    assert off(own(whole).passive(q, v), mb.dynamics(whole, "pinocchio").passive(q, v)) < CLOSE
-
-
 @pytest.mark.parametrize(("name", "floating", "at"), [("anymal", True, "base"), ("ur5", False, "tool0")])
 def test_a_joined_robot_is_that_of_pinocchio_and_of_mujoco(name, floating, at):
     base, arm = mb.load(name, floating_base=floating), mb.load("ur5")
@@ -473,23 +433,6 @@ def test_what_cannot_be_joined_is_refused(ask, words):
 
 
 # Free numbers and variants
-
-
-@pytest.mark.thorough
-@settings(max_examples=6, deadline=None)
-@given(SEEDS)
-def test_free_numbers_have_their_values_until_others_are_given(seed):
-    tree = random_tree(seed, 5, mimic=True)
-    free = tree.with_free("*.mass", "*.com", "*.inertia", "*.damping", "*.stiffness", "*.translation", "gravity")
-    (q,), (v,), (a,), _ = states(tree, 1, seed)
-    assert off(own(free).inverse_dynamics(q, v, a), own(tree).inverse_dynamics(q, v, a)) < CLOSE
-    rng = np.random.default_rng(seed)
-    mass = {name: float(rng.uniform(1, 2)) for name in free.parameters if name.endswith(".mass")}
-    b = mb.ModelBuilder.of(tree)
-    for name, x in mass.items():
-        b.set_body(name.removesuffix(".mass"), mass=x)
-    assert off(own(free).at(**mass).inverse_dynamics(q, v, a), own(b.build()).inverse_dynamics(q, v, a)) < CLOSE
-    assert free.with_parameters(**free.parameters) == tree
 
 
 def test_a_scale_is_one_factor_beside_free_numbers():

@@ -15,7 +15,7 @@ from click.testing import CliRunner, Result
 
 from mbkit._child_process import WorkerDiedError
 from mbkit.cli import cli
-from mbkit.errors import OutputError, UnknownNameError
+from mbkit.errors import OutputError
 from mbkit.load.loader import find
 from mbkit.studies.compare import all_robots as sweeps
 from mbkit.studies.compare import figure
@@ -138,13 +138,6 @@ def test_two_files_of_one_name_have_reports_of_their_own(here):
     assert {p.name for p in (here / "o").iterdir()} == {f"{stem}.{x}" for stem in stems for x in ("html", "json")}
 
 
-@pytest.mark.thorough
-@pytest.mark.usefixtures("here")
-def test_no_name_of_a_robot_is_cut(monkeypatch):
-    monkeypatch.setenv("COLUMNS", "40")
-    assert "…" not in call("robots").output
-
-
 @pytest.mark.parametrize("target", ["https://example.org/robot.urdf", "file:///tmp/robot.urdf", "package://a/b.urdf"])
 def test_a_url_is_to_be_downloaded_first(target):
     result = call("check", target)
@@ -185,23 +178,6 @@ def test_a_catalog_system_a_file_and_a_model_itself(here):
     robot = find("finger_edu")
     assert robot is not None
     assert "nv 9" in call("check", str(robot.path), "--floating-base", *QUICK).stdout
-
-
-@pytest.mark.usefixtures("here")
-def test_a_mechanism_is_checked_like_a_robot():
-    result = call("check", "slider_crank", "--full", *QUICK)
-    assert result.exit_code == 0
-    text = " ".join(result.stdout.split())
-    assert "Jᵀ λ" in text
-    assert "mujoco holds loops softly" in text
-
-
-@pytest.mark.usefixtures("here")
-def test_a_command_that_cannot_take_a_loop_names_it_and_refuses():
-    result = call("convert", "slider_crank", "--to", "urdf")
-    assert result.exit_code == 2
-    reason = " ".join(result.stderr.split())
-    assert "loop" in reason
 
 
 @pytest.mark.usefixtures("here")
@@ -368,31 +344,6 @@ def test_a_result_that_cannot_be_written_is_still_printed(monkeypatch):
     assert json.loads(result.stdout)["passed"]
 
 
-@pytest.mark.thorough
-def test_robots_lists_all_and_says_why_some_do_not_load():
-    listed = json.loads(call("robots", "--json").stdout)
-    assert len(listed) == 69
-    by_name = {r["name"]: r for r in listed}
-    assert by_name["panda_description/panda"]["nv"] == 8
-    assert "no name" in by_name["ur_description/ur3"]["reason"]
-    table = call("robots")
-    assert table.exit_code == 0
-    assert "69 robots" in table.stdout
-    assert "talos_reduced" in table.stdout
-    assert "cart_pole" in table.stdout
-
-
-@pytest.mark.usefixtures("here")
-def test_interrupting_one_check_says_that_nothing_was_finished(monkeypatch):
-    def interrupted(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("mbkit.studies.compare", interrupted)
-    result = call("check", "pendulum")
-    assert result.exit_code == 130
-    assert "interrupted" in result.stderr
-
-
 def outcomes(*statuses: str, interrupt: bool = False):
     def made(**_: object):
         for k, status in enumerate(statuses):
@@ -427,22 +378,6 @@ def test_interrupting_all_shows_and_writes_what_is_finished(here, monkeypatch):
 # Many robots.
 
 
-@pytest.mark.thorough
-def test_robots_end_in_agreement_or_a_named_reason_in_any_executor(monkeypatch):
-    # The terms of bodies are compared by tests/test_all_robots.py.
-    monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "BODY_TERMS", ())
-    with ThreadPoolExecutor(1) as executor:
-        found = {o.robot: o for o in all_robots(["ur3", "hector", "romeo_small"], samples=1, executor=executor)}
-    assert found["ur_description/ur3_robot"].status == "agree"
-    assert found["hector_description/quadrotor_base"].status == "refused"
-    assert found["hector_description/quadrotor_base"].reason.startswith("no joints")
-    small = found["romeo_description/romeo_small"]
-    assert small.status == "agree"
-    assert "RShoulderYawLink" in small.reason
-    with pytest.raises(UnknownNameError, match="panda"):
-        next(all_robots(["pandaa"]))
-
-
 def test_what_should_not_happen_to_one_robot_does_not_end_the_others(monkeypatch):
     def broken(*_: object, **__: object) -> None:
         raise ZeroDivisionError("a defect of ours")
@@ -461,13 +396,6 @@ def test_a_dying_process_is_named_and_takes_no_other_down():
     assert isinstance(found.pop("dies"), WorkerDiedError)
     assert isinstance(found.pop("raises"), ValueError)
     assert found == {"good": 3, "good0": 0, "good1": 1, "good2": 2, "good3": 3}
-
-
-def test_an_executor_that_takes_no_more_leaves_a_reason():
-    with ThreadPoolExecutor(1) as executor:
-        pass
-    found = dict(run({"a": partial(abs, 1)}, executor=executor))
-    assert isinstance(found["a"], WorkerDiedError)
 
 
 @pytest.mark.thorough

@@ -286,7 +286,7 @@ def run(motion: Known, way: str, times: np.ndarray) -> Pair:
     return on_bodies(motion, times, told)
 
 
-@pytest.mark.thorough(every=6)
+@pytest.mark.thorough(every=9)
 @pytest.mark.parametrize(("name", "way"), WAYS)
 def test_motion_is_the_known_one(name: str, way: str) -> None:
     """In every engine and every form of the equations, to what thirteen digits a step add up to."""

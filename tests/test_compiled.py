@@ -68,6 +68,7 @@ def code() -> Compiled:
     return built(mixed())
 
 
+@pytest.mark.thorough("far multiples", "multiples")
 @pytest.mark.parametrize(
     "angles",
     [

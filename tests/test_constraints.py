@@ -343,6 +343,7 @@ def test_embedded_takes_torques_and_events_on_all_coordinates(rod):
     assert np.abs(held.q - same.q).max() < 1e-10
 
 
+@pytest.mark.thorough("gauss6-setting1-5e-07")
 @pytest.mark.parametrize(
     ("method", "setting", "close"), [("rk853", {"rtol": 1e-11}, 1e-9), ("gauss6", {"dt": 0.02}, 5e-7)]
 )

@@ -58,38 +58,6 @@ def test_a_hand_built_model_survives_urdf(tmp_path: Path) -> None:
 _PLAIN = {"springs": False, "damping": False, "armature": False}
 
 
-@pytest.mark.thorough
-def test_every_catalog_system_is_written_or_told_why_not() -> None:
-    told: dict[str, str] = {}
-    for name, system in mb.catalog.systems().items():
-        model = system()
-        if model.loops:
-            with pytest.raises(UnsupportedError, match=rf"loop '{model.loops[0].name}'"):
-                mb.convert(model, "urdf")
-            others = [x.name for x in model.loops if x.kind not in ("point", "frame")]
-            if not others and not model.prescribed:
-                made = mb.convert(model, "mjcf")
-                assert made.worst < 1e-12
-                assert any("softly" in note for note in made.notes)
-                continue
-            with pytest.raises(UnsupportedError, match=rf"'{(others or [model.prescribed[0].joint])[0]}'"):
-                mb.convert(model, "mjcf")
-            continue
-        if model.no_slip:
-            for to in ("mjcf", "urdf"):
-                with pytest.raises(UnsupportedError, match=rf"no slip '{model.no_slip[0].name}'"):
-                    mb.convert(model, to)
-            continue
-        # Points and plates are below what MuJoCo takes, and are lifted to it: the motion is the same to rounding.
-        assert mb.convert(model, "mjcf").worst < 1e-12
-        try:
-            assert mb.convert(model, "urdf").worst < 1e-12
-        except UnsupportedError as error:
-            told[name] = str(error)
-    assert "'spin' is a ball joint" in told["heavy_top"]
-    assert "'stretch' has a spring" in told["elastic_pendulum"]
-
-
 def test_all_that_a_format_cannot_say_is_named_at_once() -> None:
     model = random_tree(3, 10)
     with pytest.raises(UnsupportedError) as urdf:

@@ -90,7 +90,7 @@ def test_every_engine_moves_a_random_tree_as_elimination_does(seed: int) -> None
     against_34_digits(model, q, seed, "LAPACK")
 
 
-@pytest.mark.thorough("1", "3", "4")
+@pytest.mark.thorough("1", "3", "4", "0", "2")
 @pytest.mark.parametrize("seed", SEEDS)
 def test_mujoco_follows_its_written_law_and_the_file_says_the_same(seed: int, tmp_path: Path) -> None:
     model = coupled(tree_of(seed), seed)

@@ -142,7 +142,12 @@ TORQUES = {
 
 
 @pytest.mark.thorough(
-    "a floating tree-semi_implicit_euler-feedback", "panda-rk4-feedback", "panda-rk4-each step's of each run"
+    "a floating tree-semi_implicit_euler-feedback",
+    "panda-rk4-feedback",
+    "panda-rk4-each step's of each run",
+    "a floating tree-semi_implicit_euler-none",
+    "a floating tree-semi_implicit_euler-each step's",
+    "a floating tree-semi_implicit_euler-each step's of each run",
 )
 @pytest.mark.parametrize(
     ("name", "method", "torque"),

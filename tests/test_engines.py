@@ -18,8 +18,7 @@ import mbkit as mb
 from mbkit.engines import ENGINES, QUANTITIES, Dynamics
 from mbkit.errors import InputError, MbkitError, MbkitWarning, NumericalError, UnsupportedError
 from mbkit.model import kind_of
-from mbkit.model.joint_types import KINDS
-from tests.random_trees import SOUND, off, random_tree, states
+from tests.random_trees import off, random_tree, states
 from tests.scenes import mounted
 
 VECTORS = {
@@ -90,19 +89,6 @@ def arguments(letters, q, v, a, tau):
     return [{"q": q, "v": v, "a": a, "t": tau}[x] for x in letters]
 
 
-@pytest.mark.thorough(every=3)
-@pytest.mark.parametrize("feature", ["armature", "damping", "springs", "gravity"])
-@pytest.mark.parametrize("engine", list(ENGINES))
-def test_a_feature_acts_in_every_engine_and_can_be_taken_out(engine, feature):
-    model = random_tree(3, 8, tuple(k for k in SOUND if k != "helical"))
-    q, v, a, _ = states(model, 3)
-    with_it = mb.dynamics(model, engine).inverse_dynamics(q, v, a)
-    without = mb.dynamics(model.without(feature), engine).inverse_dynamics(q, v, a)
-    reference = mb.dynamics(model.without(feature), "lagrangian").inverse_dynamics(q, v, a)
-    assert off(with_it, without) > 1e-3
-    assert off(without, reference) < CLOSE
-
-
 @cache
 def floating(robot, engine):
     return mb.dynamics(mb.load(robot, floating_base=True), engine)
@@ -129,37 +115,6 @@ def test_declaration_order_of_joints_does_not_matter_to_the_physics(engine):
     # And the reference itself, by moving one joint alone: a slide of z1 carries z1 and z2.
     M = mb.dynamics(model, engine).mass_matrix(q[0])
     assert M[model.layout.v["z1"].start, model.layout.v["z1"].start] == pytest.approx(2.0)
-
-
-@pytest.mark.parametrize("engine", list(ENGINES))
-def test_bodies_fixed_to_the_world_count_in_the_energy_and_nowhere_else(engine):
-    def made(mass):
-        b = mb.ModelBuilder("with_base")
-        b.add_body("base", mass=mass, com=(0, 0, 0.7))
-        b.add_joint("mount", "fixed", parent="world", child="base", translation=(0, 0, 0.3), rpy=(0, 0, 0.4))
-        b.add_body("arm", mass=1.0, com=(0.2, 0, 0), inertia=(0.1, 0.1, 0.1))
-        b.add_joint("j", "revolute", parent="base", child="arm", axis=(0, 1, 0))
-        return mb.dynamics(b.build(), engine)
-
-    heavy, light = made(5.0), made(0.0)
-    assert heavy.potential_energy([0.3]) - light.potential_energy([0.3]) == pytest.approx(5 * 9.81 * 1.0)
-    assert np.array_equal(heavy.mass_matrix([0.3]), light.mass_matrix([0.3]))
-
-
-@pytest.mark.parametrize("engine", list(ENGINES))
-def test_jacobians_and_poses_are_those_of_the_motion(engine):
-    model = random_tree(2, 6, ("ball", "free", "revolute", "planar", "spherical_zyx", "prismatic"))
-    dyn = mb.dynamics(model, engine)
-    q, v, _, _ = (x[0] for x in states(model, 1))
-    h = 1e-6
-    ahead, behind = (dyn.pose(model.integrate(q, s * h * v), "tip") for s in (1, -1))
-    rate, R = (ahead - behind) / (2 * h), dyn.pose(q, "tip")[:3, :3]
-    spin = rate[:3, :3] @ R.T
-    twist = np.array([*rate[:3, 3], spin[2, 1], spin[0, 2], spin[1, 0]])
-    # The difference quotient is good to h² and eps/h.
-    assert np.allclose(dyn.jacobian(q, "tip") @ v, twist, atol=1e-8)
-    turned = np.concatenate([R.T @ twist[:3], R.T @ twist[3:]])
-    assert np.allclose(dyn.jacobian(q, "tip", "body") @ v, turned, atol=1e-8)
 
 
 @pytest.mark.parametrize("engine", list(ENGINES))
@@ -353,27 +308,6 @@ def test_what_an_engine_cannot_do_has_a_reason():
         mb.dynamics(random_tree(0, 1, ("helical",)), "mujoco")
 
 
-class Odd(type(KINDS["revolute"])):
-    """A joint type that no adapter has a counterpart of."""
-
-    name = "odd"
-
-
-def test_a_joint_type_that_an_engine_does_not_have_is_named(monkeypatch):
-    monkeypatch.setitem(KINDS, "odd", Odd())
-    b = mounted("arm", "a", "hinge", "odd", mass=1.0, com=(0, 0, 1), axis=(0, 1, 0))
-    model = b.build()
-    others = [name for name in ENGINES if name not in ("lagrangian", "oracle")]
-    for engine in others:
-        with pytest.raises(UnsupportedError, match=f"{engine}: (arm: )?joint 'hinge' is odd"):
-            mb.dynamics(model, engine)
-    # The own derivation reads the type's formulas.
-    assert mb.dynamics(model, "lagrangian").gravity([0.3]) == pytest.approx(-9.81 * np.sin(0.3))
-    result = mb.compare(model, ("lagrangian", *others), samples=1, terms_only=True)
-    assert [r.engine for r in result.refusals] == others
-    assert all("'hinge' is odd" in r.reason for r in result.refusals)
-
-
 @pytest.mark.parametrize("engine", list(ENGINES))
 def test_a_loop_that_no_joint_can_open_is_refused_and_not_ignored(engine):
     b = mounted("loop", "a", "j", "revolute", mass=1.0, com=(0, 0, 1), axis=(0, 1, 0))
@@ -439,18 +373,6 @@ def test_mujoco_writes_no_log_and_gives_no_number_where_there_is_none(tmp_path, 
         dyn.forward_dynamics(np.zeros(2), np.ones(2), np.ones(2))
     assert os.listdir(tmp_path) == []
     assert "WARNING" not in capfd.readouterr().err
-
-
-def test_a_singular_mass_matrix_is_named_and_never_nan():
-    b = mounted("light tip", "arm", "shoulder", "revolute", mass=1.0, com=(0, 0, -0.5), axis=(0, 1, 0))
-    b.add_body("tip", mass=0.0)
-    b.add_joint("wrist", "revolute", parent="arm", child="tip", axis=(0, 1, 0), translation=(0, 0, -1))
-    with pytest.warns(MbkitWarning, match="no mass moves"):
-        model = b.build(nonphysical="warn")
-    q, v, _, tau = (x[0] for x in states(model, 1))
-    for engine in ("pinocchio", "lagrangian"):
-        with pytest.raises(NumericalError, match="no mass moves"):
-            mb.dynamics(model, engine).forward_dynamics(q, v, tau)
 
 
 def test_a_point_spring_of_no_length_pulls_and_does_not_divide_by_zero():

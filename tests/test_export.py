@@ -81,7 +81,7 @@ def arguments_of(quantity, model, n, seed=0):
     return [named[name] for name in FUNCTIONS[quantity]]
 
 
-@pytest.mark.thorough("panda", "solo12", "tree", "pair")
+@pytest.mark.thorough("panda", "solo12", "tree", "pair", "bars")
 def test_every_quantity_is_casadis_to_the_bit(compiled):
     dyn = mb.dynamics(compiled.model, "lagrangian")
     for quantity in compiled.functions:
@@ -92,7 +92,7 @@ def test_every_quantity_is_casadis_to_the_bit(compiled):
                 np.testing.assert_array_equal(got, want.full(), err_msg=quantity)
 
 
-@pytest.mark.thorough("panda", "panda_free")
+@pytest.mark.thorough("panda", "panda_free", "solo12", "pair")
 def test_every_quantity_is_the_engines(compiled):
     dyn = mb.dynamics(compiled.model, "lagrangian")
     for quantity, described in compiled.functions.items():
@@ -108,6 +108,7 @@ def test_every_quantity_is_the_engines(compiled):
                 assert off(g.reshape(np.shape(w)), w) < 256 * EPS * conditions[k], quantity
 
 
+@pytest.mark.thorough("panda")
 def test_an_output_may_lie_on_an_input(compiled):
     for quantity, on in (("forward_dynamics", "tau"), ("inverse_dynamics", "a"), ("nle", "v")):
         if quantity not in compiled.functions:

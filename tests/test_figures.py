@@ -111,7 +111,7 @@ STUDIES: dict[str, Any] = {
 }
 
 
-@pytest.mark.thorough("double pendulum", "panda", "anymal", "batch")
+@pytest.mark.thorough("double pendulum", "panda", "anymal", "batch", "diverged")
 @pytest.mark.parametrize("name", RUNS)
 def test_no_text_of_a_run_is_cut_or_lies_on_another(name: str) -> None:
     run = RUNS[name]()

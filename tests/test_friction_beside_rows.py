@@ -82,7 +82,7 @@ def crank_energies(theta: float) -> tuple[float, float]:
     return kinetic / 2, 9.81 * (crank * R / 2 * np.sin(theta) + coupler * (R * np.sin(theta) + L / 2 * np.sin(phi)))
 
 
-@pytest.mark.thorough(every=2)
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize(("engine", "method", "most", "t0"), [
     ("lagrangian", "rk853", 1e-9, 0.0), ("lagrangian", "dop853", 1e-9, 0.0), ("lagrangian", "rodas5", 1e-8, 0.0),
     ("lagrangian", "rk4", 2e-7, 0.0), ("lagrangian", "gauss4", 2e-7, 0.0), ("pinocchio", "dop853", 1e-9, 0.0),
@@ -160,7 +160,7 @@ def four_bar_weight(theta: float) -> float:
     return float(four_bar_terms(theta + 1e-40j)[-1].imag / 1e-40)
 
 
-@pytest.mark.thorough(every=3)
+@pytest.mark.thorough(every=5)
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "compiled"])
 @pytest.mark.parametrize(("method", "more"), [
     ("rk853", ADAPTIVE), ("dop853", ADAPTIVE), ("rk4", {"dt": 0.01}), ("gauss4", {"dt": 0.01}),
@@ -337,7 +337,7 @@ def slid(start: float, end: float, side: float) -> tuple[float, float]:
     return way + push * (end - start) ** 2 / 2, speed
 
 
-@pytest.mark.thorough(every=2)
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
 @pytest.mark.parametrize(("method", "more", "most"), [("rk853", ADAPTIVE, 1e-9), ("rk4", {"dt": 0.01}, 1e-7)])
 def test_a_block_on_a_shaken_table_sticks_and_slides(
@@ -361,6 +361,7 @@ def test_a_block_on_a_shaken_table_sticks_and_slides(
         assert (run.v[rests, 1] == 0).all()
 
 
+@pytest.mark.thorough("rk853")
 @pytest.mark.parametrize("method", ["rk853", "rk4"])
 def test_a_drive_that_leaves_no_freedom_turns_the_pins_with_it(method: str) -> None:
     """The pose and the speed are those of the crank's angle, 1.2 + ½ sin 3t, which turns at π/6 s."""
@@ -385,7 +386,7 @@ def test_a_drive_that_leaves_no_freedom_turns_the_pins_with_it(method: str) -> N
     assert np.abs(v - at(0.55)[1]).max() < 1e-9
 
 
-@pytest.mark.thorough(every=3)
+@pytest.mark.thorough(every=5)
 @pytest.mark.parametrize(("method", "more"), [
     ("rk853", {}), ("dop853", {}), ("rk4", {"dt": 2e-3}), ("rk4", {"dt": 1.9e-3}), ("gauss4", {"dt": 1.9e-2}),
 ])  # fmt: skip
@@ -485,7 +486,7 @@ def turned(model: Model, angle: float) -> np.ndarray:
     return np.array([-angle if j.name == "bar" else angle for j in model.joints])
 
 
-@pytest.mark.thorough(every=3)
+@pytest.mark.thorough(every=5)
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "compiled"])
 @pytest.mark.parametrize(("method", "more"), [("dop853", ADAPTIVE), ("rk4", {"dt": 2e-3}), ("gauss4", {"dt": 5e-3})])
 def test_a_parallelogram_of_three_cranks_rests_where_next_to_no_force_is_needed(
@@ -581,6 +582,7 @@ def part_of_bounds(pins: np.ndarray, bounds: np.ndarray, needed: np.ndarray) -> 
     return max(abs(n @ needed) / (bounds @ np.abs(pins @ n)) for n in normals)
 
 
+@pytest.mark.thorough("lagrangian")
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "compiled"])
 def test_a_five_bar_lets_go_where_no_share_of_its_pins_is_within_their_bounds(engine: str) -> None:
     """The forces of five pins along two freedoms fill a polygon; its edges are those of its vertices' hull."""
@@ -608,7 +610,7 @@ def test_a_five_bar_lets_go_where_no_share_of_its_pins_is_within_their_bounds(en
         assert np.abs(dyn.constraint_residual(run.q[-1])).max() < 1e-12
 
 
-@pytest.mark.thorough(every=2)
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("friction", [1e-10 * FIVE, np.array([1e-9, 1, 1, 1e-9, 1]), np.array([1, 1e-14, 1, 1, 1])])
 @pytest.mark.parametrize(("method", "more"), [("dop853", ADAPTIVE), ("rk4", {"dt": 0.01})])
 def test_a_five_bar_lets_go_as_its_bounds_say_whatever_their_sizes(
@@ -637,6 +639,7 @@ def test_bounds_that_differ_by_14_decades_are_refused_by_name_where_the_large_on
     assert run.stats.ended == "diverged"
 
 
+@pytest.mark.thorough("pinocchio")
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
 def test_moreau_s_steps_pass_dead_centres(engine: str) -> None:
     """The rocker turns while the others go on; a rate of the rows that is not zero would let all three never rest."""
@@ -759,7 +762,7 @@ def started(speeds: list[float]) -> tuple[np.ndarray, np.ndarray]:
     return np.array([q for q, _ in states]), np.array([x * slope for (_, slope), x in zip(states, speeds, strict=True)])
 
 
-@pytest.mark.thorough(every=2)
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize(
     ("method", "engine"), [(x, "lagrangian") for x in ("rk4", "gauss4", "moreau")] + [("rk4", "compiled")]
 )
@@ -819,6 +822,7 @@ def rubbing(name: str, seed: int, **options: bool) -> tuple[Any, np.ndarray, np.
     return dyn, *dyn.model.random_state(rng)
 
 
+@pytest.mark.thorough("planar_3rrr")
 @pytest.mark.parametrize("name", ["planar_3rrr", "five_bar", "double_cardan_shaft", "chaplygin_sleigh"])
 def test_methods_agree_on_mechanisms_with_stiction_at_all_joints(name: str) -> None:
     """A slide of the shaft rests by itself, and hardly responds to forces."""
@@ -836,6 +840,7 @@ def test_a_joint_that_turns_at_a_singular_pose_ends_a_run_by_name_or_passes_with
     assert "singular pose" in "".join((run.stats.message, *run.stats.doubts))
 
 
+@pytest.mark.thorough("rk853")
 @pytest.mark.parametrize("method", ["rk853", "rk4"])
 def test_rods_that_only_shift_are_in_no_event(method: str) -> None:
     """Two of these pins do not turn, but for rounding."""

@@ -55,6 +55,7 @@ def require_same(batch: Any, alone: list, tolerance: float = 1e-9) -> None:
     assert len({e.t for e in batch.events}) > len(batch.events) // 2
 
 
+@pytest.mark.thorough("1-gauss4", "0-rk4")
 @pytest.mark.parametrize("method", ["rk4", "semi_implicit_euler", "gauss4"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_members_change_phases_at_their_own_times(method: str, seed: int) -> None:
@@ -147,6 +148,7 @@ def with_free_friction(seed: int, n: int = 3) -> tuple[Model, dict[str, np.ndarr
     return b.build(), values
 
 
+@pytest.mark.thorough("rk853", "semi_implicit_euler")
 @pytest.mark.parametrize("method", ["rk4", "semi_implicit_euler", "gauss4", "moreau", "rk853"])
 def test_samples_with_friction_of_their_own_are_models_with_these_numbers(method: str) -> None:
     model, values = with_free_friction(11)
@@ -224,6 +226,7 @@ def test_variants_of_friction_slide_as_in_the_closed_form() -> None:
     np.testing.assert_allclose(run.q[:, -1, 0], 3.0 - drawn / 2, rtol=0, atol=1e-13)
 
 
+@pytest.mark.thorough("rk853-True-1e-08")
 @pytest.mark.parametrize(("method", "compiled", "most"), [
     ("rk853", False, 1e-8), ("rk853", True, 1e-8), ("rk4", False, 1e-6), ("rk4", True, 1e-6), ("moreau", True, 2e-2),
 ])  # fmt: skip

@@ -77,7 +77,7 @@ def torques(model: Model, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.nda
     return mb.dynamics(model, "pinocchio").inverse_dynamics(q, v, a)
 
 
-@pytest.mark.thorough("pinocchio-ur5", "pinocchio-panda", "mujoco-ur5")
+@pytest.mark.thorough("pinocchio-ur5", "pinocchio-panda", "mujoco-ur5", "lagrangian-panda")
 @pytest.mark.parametrize("name", ["ur5", "panda"])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_exact_from_exact_torques(name: str, engine: str) -> None:

@@ -48,6 +48,7 @@ def test_terms_add_up(tree):
     assert off(dyn.inverse_dynamics(q, v, a), total) < CLOSE
 
 
+@pytest.mark.thorough("4", "5")
 def test_mass_matrix_rate_less_twice_coriolis_is_skew(tree):
     # Ṁ exactly: the directional derivative of the expressions of M along D v.
     model, dyn, (q, v, _, _) = tree
@@ -83,14 +84,14 @@ def test_power_balances(tree):
     assert off(dyn.energy_rate(q, v, a), power) < 1e-12
 
 
-@pytest.mark.thorough("3", "5")
+@pytest.mark.thorough("3", "5", "4")
 def test_forward_dynamics_inverts_inverse_dynamics(tree):
     _, dyn, (q, v, a, _) = tree
     back = dyn.forward_dynamics(q, v, dyn.inverse_dynamics(q, v, a))
     assert off(back, a) < 1e-14 * np.linalg.cond(dyn.mass_matrix(q)).max()
 
 
-@pytest.mark.thorough(every=4)
+@pytest.mark.thorough(every=7)
 @pytest.mark.parametrize("elimination", ["links", "mass matrix", "least constraint"])
 def test_every_elimination_equals_lapack(tree, elimination):
     model, dyn, (q, v, _, tau) = tree

@@ -29,7 +29,7 @@ def plans(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     return asked
 
 
-@pytest.mark.thorough("0.001-False")
+@pytest.mark.thorough("0.001-False", "0.004-False")
 @pytest.mark.parametrize(("dt", "thorough"), [(1e-3, False), (4e-3, False), (1.6e-2, True), (3.2e-2, True)])
 def test_long_steps_are_taken_again_with_three_iterations(
     dt: float, thorough: bool, monkeypatch: pytest.MonkeyPatch
@@ -173,7 +173,9 @@ MODELS = {
 }
 
 
-@pytest.mark.thorough("stiff four-bar-rodas5", "flyball_governor-rodas5", "bricard-rodas5", "rolling_disc-rodas5")
+@pytest.mark.thorough(
+    "stiff four-bar-rodas5", "flyball_governor-rodas5", "bricard-rodas5", "rolling_disc-rodas5", "rolling_disc-auto"
+)
 @pytest.mark.parametrize(
     ("name", "method"), [*((name, "rodas5") for name in MODELS), ("stiff four-bar", "auto"), ("rolling_disc", "auto")]
 )

@@ -265,6 +265,7 @@ def loose(kind: str, gravity=(0.3, 0.2, -9.81)) -> mb.Model:
     return b.build(nonphysical="warn")
 
 
+@pytest.mark.thorough("revolute", "cylindrical", "frame")
 @pytest.mark.parametrize("kind", LOOP_KINDS)
 def test_a_body_that_a_loop_holds_begins_to_move_as_newton_and_euler_say(kind):
     model = loose(kind)
@@ -289,6 +290,7 @@ def test_a_body_that_a_loop_holds_begins_to_move_as_newton_and_euler_say(kind):
     assert a == pytest.approx(expected[[0, 1, 2, 5, 4, 3]], abs=1e-12)
 
 
+@pytest.mark.thorough("universal", "prismatic", "point")
 @pytest.mark.parametrize("kind", LOOP_KINDS)
 def test_every_kind_of_loop_has_the_rows_and_accelerations_of_the_engine(kind):
     model = loose(kind)
@@ -304,6 +306,7 @@ def test_every_kind_of_loop_has_the_rows_and_accelerations_of_the_engine(kind):
 TILTED = Rotation.from_rotvec([0.4, -0.9, 0.3]).as_matrix()
 
 
+@pytest.mark.thorough("revolute-0-2", "prismatic-1-2")
 @pytest.mark.parametrize(("kind", "turn", "rows"), [("revolute", 0, 2), ("cylindrical", 1, 2), ("prismatic", 1, 2)])
 def test_a_loop_in_a_tilted_plane_has_the_rows_that_the_plane_leaves(kind, turn, rows):
     """Of named lengths too: what rounding leaves of directions is no row."""

@@ -343,6 +343,7 @@ def test_mujocos_own_steps_have_its_springs_of_ball_and_free_joints(tmp_path: Pa
         mb.simulate(mb.dynamics(b.build(), "mujoco"), [0, 0, 0, 1], [1, 0, 0], 0.1, "mujoco_rk4", 1e-2)
 
 
+@pytest.mark.thorough("3-True")
 @pytest.mark.parametrize(("spring", "run"), [("3", True), ("3 0 2", False)])
 def test_a_check_runs_springs_of_ball_joints_or_says_why_not_and_names_what_is_left_out(
     spring: str, run: bool, tmp_path: Path
@@ -506,7 +507,7 @@ def test_what_acts_on_a_path_and_has_no_description_is_refused(
         mb.load(written(text, tmp_path))
 
 
-@pytest.mark.thorough(every=4)
+@pytest.mark.thorough(every=8)
 @pytest.mark.parametrize("seed", range(24))
 def test_random_tendons_are_those_of_mujoco(seed: int, tmp_path: Path) -> None:
     text = with_tendons(random_mjcf(seed), seed)
@@ -534,7 +535,7 @@ def moved(name: str, given: dict[str, str]) -> str:
       {actuator}</mujoco>"""
 
 
-@pytest.mark.thorough("general", "position", "velocity", "pid", "cylinder")
+@pytest.mark.thorough("general", "position", "velocity", "pid", "cylinder", "damper")
 @pytest.mark.parametrize("name", ["fixed", "spatial", "general", "position", "velocity", "pid", "damper", "cylinder"])
 def test_no_attribute_of_tendons_and_actuators_changes_the_motion_in_silence(name: str, tmp_path: Path) -> None:
     """M, nle and passive forces are as in MuJoCo or refused; at zero control a note may say what is left out."""

@@ -108,7 +108,7 @@ def test_whatever_a_builder_is_given_is_built_or_refused_by_name(wrong):
     built_or_refused(wrong)
 
 
-@pytest.mark.thorough(every=4)
+@pytest.mark.thorough(every=6)
 @pytest.mark.parametrize("method", METHODS)
 def test_each_argument_of_a_builder_is_built_or_refused_by_name(method):
     for place in (p for p in PLACES if p[0] == method):

@@ -11,11 +11,9 @@ import casadi as ca
 import numpy as np
 import pytest
 import sympy as sp
-from click.testing import CliRunner
 from scipy.interpolate import BSpline, CubicSpline, PchipInterpolator, PPoly, make_interp_spline
 
 import mbkit as mb
-from mbkit.cli import cli
 from mbkit.errors import InputError, ModelError
 from tests.scenes import chain, hinge, linkage
 
@@ -303,25 +301,3 @@ def test_coordinates_that_follow_a_table_are_filled_in_where_it_is_drawn() -> No
 
     q = _with_prescribed(model, run.q, run.t)
     assert np.abs(q[:, 0] - SPLINES["natural"](run.t)).max() < 1e-13
-
-
-@pytest.mark.thorough
-def test_the_command_simulates_from_a_time(tmp_path: Any, monkeypatch: Any) -> None:
-    (tmp_path / "late_model.py").write_text(
-        "import mbkit as mb\n\n\ndef late():\n    b = mb.ModelBuilder('late')\n"
-        "    b.add_body('bob', mass=1.0, com=(0, 0, -1), inertia=(0.1, 0.1, 0.1))\n"
-        "    b.add_joint('hinge', 'revolute', parent='world', child='bob', axis=(0, 1, 0))\n"
-        "    b.prescribe('hinge', ([1.0, 2.0, 3.0, 4.0], [0.0, 0.2, 0.1, 0.3]))\n    return b.build()\n"
-    )
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    x = CubicSpline([1.0, 2.0, 3.0, 4.0], [0.0, 0.2, 0.1, 0.3], bc_type="natural")
-    given = ["late_model:late", "--engine", "lagrangian", "--q0", str(x(1.5)), "--v0", str(x(1.5, 1)), "--t0", "1.5"]
-    done = CliRunner().invoke(cli, ["simulate", *given, "--save", "4", "--out", str(tmp_path)])
-    assert done.exit_code == 0, done.output
-    rows = np.genfromtxt(next(tmp_path.glob("*-trajectory.csv")), delimiter=",", skip_header=1)
-    assert np.allclose(rows[:, 0], [1.5, 1.75, 2.0, 2.25, 2.5])
-    assert np.abs(rows[:, 1] - x(rows[:, 0])).max() < 1e-12
-    late = CliRunner().invoke(cli, ["simulate", *given, "--duration", "9", "--out", str(tmp_path)])
-    assert late.exit_code == 2
-    assert "not known at 10.5 s" in late.output

@@ -31,14 +31,14 @@ def survivors(mutation: str, path: str, folder: Path, most: int | None = None) -
     return out
 
 
-@pytest.mark.thorough(every=8)
+@pytest.mark.thorough(every=11)
 @pytest.mark.parametrize("mutation", ["dropped", "admitted"])
 @pytest.mark.parametrize("gate", GATES)
 def test_a_gate_that_forgets_a_kind_or_lets_one_pass_is_noticed(gate: str, mutation: str, tmp_path: Path) -> None:
     assert survivors(mutation, gate, tmp_path, most=1) == []
 
 
-@pytest.mark.thorough(every=12)
+@pytest.mark.thorough(every=17)
 @pytest.mark.parametrize("path", COLUMNS)
 def test_a_path_without_a_part_is_not_right(path: str, tmp_path: Path) -> None:
     assert survivors("removed", path, tmp_path, most=1) == []

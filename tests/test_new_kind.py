@@ -109,6 +109,7 @@ def test_engines_have_it(name, engine) -> None:
     assert dyn.potential_energy(Q) == pytest.approx(more, rel=1e-14)
 
 
+@pytest.mark.thorough("damper")
 @pytest.mark.usefixtures("known")
 @pytest.mark.parametrize("name", NAMES)
 def test_texts_have_it(name, tmp_path: Path) -> None:
@@ -131,6 +132,7 @@ def test_texts_have_it(name, tmp_path: Path) -> None:
             mb.convert(model, kind)
 
 
+@pytest.mark.thorough("taylor", "gauss6")
 @pytest.mark.usefixtures("known")
 @pytest.mark.parametrize("method", ["rk853", "rk4", "implicit_midpoint", "gauss6", "rodas5", "taylor"])
 def test_a_spring_keeps_the_energy_and_a_damper_takes_what_it_should(method) -> None:

@@ -111,15 +111,6 @@ def test_studies_and_the_command_take_it(tmp_path: object) -> None:
     assert "heun" in result.output
 
 
-@pytest.mark.thorough
-def test_it_breaks_like_others_in_a_worker_process() -> None:
-    register_method(Method("heun2", "fixed", 2, 2, "", solver="fixed_step:run_fixed", formula_source=lambda: HEUN))
-    result = mb.stress("joint_spring", ["pinocchio"], ["heun", "heun2", "trapezoid"], values=[1.0], jobs=1)
-    heun, same, trapezoid = (row.cells[0] for row in result.cases[0].rows)
-    assert {cell.end for cell in (heun, same, trapezoid)} == {"finished"}
-    assert heun.error == same.error != trapezoid.error
-
-
 def test_its_stability_is_computed_from_its_tableau() -> None:
     assert METHODS["heun"].stability.largest_step(1.0, 0.0) == 0.0  # type: ignore[union-attr]
     assert METHODS["heun"].stability.largest_step(1.0, 1.0) == pytest.approx(2.0)  # type: ignore[union-attr]

@@ -93,7 +93,7 @@ def test_a_field_without_a_rule_is_refused_by_name() -> None:
         Table("x", None)
 
 
-@pytest.mark.thorough(every=3)
+@pytest.mark.thorough(every=5)
 @pytest.mark.parametrize("name", [n for n in EXAMPLES if n != "energies" and not n.startswith("written.")])
 def test_a_number_of_each_kind_may_be_free(name: str) -> None:
     """With other values the freed model is the one that has them as plain numbers."""

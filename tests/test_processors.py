@@ -165,7 +165,7 @@ def ways(own: Any, paper: Any, q: np.ndarray, v: np.ndarray, method: str, h: flo
 
 # One of each kind of row in the suite, and one that moves in space.
 @pytest.mark.thorough(
-    "rolling_disc", "flyball_governor", *(m for m in MECHANISMS if m not in (*FEW, "bricard", "delta_robot"))
+    *("rolling_disc", "flyball_governor", PAPER), *(m for m in MECHANISMS if m not in (*FEW, "delta_robot"))
 )
 # The robot on three arms compiles longest; the platform on six legs has as many loops.
 @pytest.mark.parametrize("name", [*(m for m in MECHANISMS if m != "delta_robot"), PAPER, "driven_pendulum"])

@@ -186,7 +186,7 @@ def test_exact_motions_start_where_their_scenes_do(scene: Scene) -> None:
 # Simulations
 
 
-@pytest.mark.thorough(every=3)
+@pytest.mark.thorough(every=5)
 @pytest.mark.parametrize("way", [MUJOCO, PINOCCHIO, TAYLOR, COMPILED, ORACLE], ids=str)
 @pytest.mark.parametrize("problem", ["pendulum (IFToMM A01)", "heavy top", "spherical pendulum"])
 def test_published_problems_on_every_engine(problem: str, way: Way) -> None:

@@ -272,6 +272,7 @@ ASKED: dict[str, tuple[int, tuple[str, ...]]] = {
 }
 
 
+@pytest.mark.thorough("forward_dynamics_derivatives-False", "inverse_dynamics_derivatives-False")
 @pytest.mark.parametrize("parametric", [False, True])
 @pytest.mark.parametrize("name", ASKED)
 def test_every_way_to_ask_has_the_same_bits(name: str, parametric: bool) -> None:

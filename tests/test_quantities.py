@@ -29,7 +29,7 @@ OF_ROWS = [x for x in of_groups("row") if x.startswith(("constraint_r", "constra
 
 @pytest.mark.thorough(
     *("revolute", "continuous", "prismatic", "spherical_zyx", "ball", "planar", "cylindrical", "without springs"),
-    *("loop.revolute", "loop.prismatic", "planar_3rrr"),
+    *("free", "universal", "loop.revolute", "loop.prismatic", "loop.cylindrical", "loop.distance", "planar_3rrr"),
 )
 @pytest.mark.parametrize("name", MODELS)
 def test_each_quantity_is_right_or_refused(name):
@@ -88,7 +88,7 @@ FEATURES = {
 }
 
 
-@pytest.mark.thorough(every=4)
+@pytest.mark.thorough(every=6)
 @pytest.mark.parametrize(
     ("engine", "feature"),
     [

@@ -178,7 +178,7 @@ def without(basis: list[tuple[int, mp.matrix]], y: mp.matrix) -> mp.matrix:
     return y
 
 
-@pytest.mark.thorough(every=125)
+@pytest.mark.thorough(every=251)
 @pytest.mark.parametrize("seed", range(1000))
 def test_accelerations_keep_what_the_condition_of_the_rows_leaves(seed: int) -> None:
     mechanism = Mechanism(seed)
@@ -474,6 +474,7 @@ def rod_between_cranks(length: float) -> mb.Model:
     return b.build()
 
 
+@pytest.mark.thorough("oracle-options2")
 @pytest.mark.parametrize(("engine", "options"), QUICK)
 def test_a_rod_that_is_too_long_for_its_cranks_is_refused_with_what_is_left(engine: str, options: dict) -> None:
     q, v = np.array([0.3, 0.6]), np.zeros(2)

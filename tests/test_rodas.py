@@ -185,6 +185,7 @@ def test_batches_events_and_held_torques() -> None:
     assert ends[0] == pytest.approx(ends[1], abs=1e-10)
 
 
+@pytest.mark.thorough("True")
 @pytest.mark.parametrize("compiled", [True, False])
 def test_the_clock_s_start_changes_no_step(compiled: bool) -> None:
     """A four-bar does not know the time: its steps are the same from every start, compiled or not."""

@@ -206,16 +206,6 @@ def test_rollouts_in_stages_are_the_stepwise_runs(method: str, floating: Lagrang
     assert len(floating._step_plan(method).parts) > 1
 
 
-def test_torques_of_every_shape_are_held(planar: LagrangianDynamics) -> None:
-    q, v = start(planar, 5)
-    rng = np.random.default_rng(0)
-    for shape in ((2,), (40, 2), (5, 40, 2)):
-        tau = rng.standard_normal(shape)
-        assert_same(simulate(planar, q, v, 0.04, torque=tau), stepwise(planar, q, v, 0.04, torque=tau))
-    run = simulate(planar, q[2], v[2], 0.04, torque=tau[2])
-    assert np.array_equal(run.q, simulate(planar, q, v, 0.04, torque=tau).q[2])
-
-
 @pytest.mark.thorough("1", "3", "save7", "save8", "save9")
 @pytest.mark.parametrize("save", [None, 1, 2, 3, 17, 50, [0.0], [0.0355], [0.0, 0.001, 0.016, 0.0355], [0.016, 0.017]])
 def test_what_is_kept_is_the_same_whatever_else_is(save: Any, floating: LagrangianDynamics) -> None:
@@ -397,28 +387,6 @@ def test_an_error_in_the_callers_function_stops_the_threads(
         dyn = dynamics(planar.model, "lagrangian", compile=True, threads=threads)
         with pytest.raises(StopError):
             simulate(dyn, q, v, 1e3, save=[0.0], progress=stop)
-
-
-@pytest.mark.parametrize(("method", "order"), [("rk4", 4), ("semi_implicit_euler", 1)])
-def test_order_of_convergence_and_of_energy(method: str, order: int, floating: LagrangianDynamics) -> None:
-    q, v = start(floating, 4, seed=2)
-    fine = simulate(floating, q, v, 0.4, "rk4", dt=2.5e-4, save=[0.4])
-    steps = [2e-2, 1e-2, 5e-3] if method == "rk4" else [4e-4, 2e-4, 1e-4]
-    errors, drift = [], []
-    for dt in steps:
-        run = simulate(floating, q, v, 0.4, method, dt=dt, save=[0.0, 0.4])
-        errors.append(np.linalg.norm(floating.model.difference(run.q[:, -1], fine.q[:, -1])))
-        drift.append(np.abs(np.diff(run.energy())).max())
-    slopes = [np.polyfit(np.log(steps), np.log(x), 1)[0] for x in (errors, drift)]
-    assert slopes[0] == pytest.approx(order, abs=0.25)
-    assert slopes[1] > order - 0.35
-
-
-def test_quaternions_stay_of_unit_length(floating: LagrangianDynamics) -> None:
-    q, v = start(floating, 3)
-    run = simulate(floating, q, 4 * v, 1.0, dt=5e-3, save=10)
-    for first, _ in floating.model.quaternions:
-        assert np.abs(np.linalg.norm(run.q[..., first : first + 4], axis=-1) - 1).max() < 8 * EPS
 
 
 def test_a_body_without_forces_keeps_its_velocity_to_the_bit() -> None:

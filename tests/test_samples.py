@@ -90,7 +90,7 @@ CASES = [
 ERROR = {"bdf": 1e-7, "lsoda": 1e-7} | {name: 1e-6 for name in METHODS if name.startswith("drake")}
 
 
-@pytest.mark.thorough(every=20)
+@pytest.mark.thorough(every=31)
 @pytest.mark.parametrize(("name", "engine", "method"), CASES)
 def test_a_sampled_torque_is_that_of_runs_cut_at_the_samples(name, engine, method):
     """Each method asks once at each sample, of one state, of a batch and of a policy."""

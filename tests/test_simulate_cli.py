@@ -213,19 +213,3 @@ def test_the_help_ends_in_examples_that_parse(path: tuple[str, ...]) -> None:
         group = isinstance(ALL[path], click.Group)
         assert command is ALL[path] or (group and command in ALL[path].commands.values())  # type: ignore[attr-defined]
         command.make_context("mbkit", words)
-
-
-@pytest.mark.parametrize("group", [(), ("baseline",)])
-def test_lists_of_commands_have_whole_sentences(group: tuple[str, ...]) -> None:
-    shown = " ".join(call(*group, "--help").output.split())
-    assert "..." not in shown.partition("Commands:")[2]
-    for path, command in ALL.items():
-        if path[:-1] == group:
-            sentence = " ".join((command.help or "").split()).partition(". ")[0].rstrip(".")
-            assert f"{path[-1]} {sentence}" in shown
-
-
-def test_the_option_of_what_is_written_has_one_spelling() -> None:
-    options = {name for command in ALL.values() for p in command.params for name in (*p.opts, *p.secondary_opts)}
-    assert "--out" in options
-    assert not options & {"-o", "--output", "--outdir", "--folder"}

@@ -488,6 +488,7 @@ def test_drake_s_own_steps_are_no_longer_than_its_own_longest() -> None:
     assert abs(run.q - exact.q).max() < 1e-7
 
 
+@pytest.mark.thorough("True")
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 @pytest.mark.parametrize("study", [False, True])
 def test_a_native_run_ends_at_ctrl_c(study: bool) -> None:
@@ -534,6 +535,7 @@ def test_a_large_table_is_read_in_pieces_between_which_ctrl_c_is_heard() -> None
         finite_array("torque", table, table.shape)
 
 
+@pytest.mark.thorough("True")
 @pytest.mark.parametrize("compiled", [True, False])
 def test_a_run_a_step_and_their_work_change_nothing_of_their_arguments(compiled: bool) -> None:
     dyn = dynamics(catalog.four_bar(), "lagrangian", compile=compiled)

@@ -471,7 +471,7 @@ class KiteMotion:
 PLACES = [0.3, *(c + x for c in (0.0, 0.5, 1.0, 0.5 - 3**0.5 / 6, 0.5 + 0.15**0.5) for x in (1e-3, -1e-6, 1e-9, 0.0))]
 
 
-@pytest.mark.thorough(every=25)
+@pytest.mark.thorough(every=41)
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize(
     ("method", "close"), [("rk4", 3e-9), ("gauss4", 3e-9), ("gauss6", 3e-9), ("semi_implicit_euler", 2e-3)]
@@ -516,7 +516,7 @@ def test_an_adaptive_run_has_its_states_at_and_beside_a_pose(method, rtol, close
     assert np.abs(np.angle(np.exp(1j * off))).max() < close
 
 
-@pytest.mark.thorough(every=5)
+@pytest.mark.thorough(every=12)
 @pytest.mark.parametrize("method", ["lsoda", "bdf"])
 @pytest.mark.parametrize("rtol", [1e-10, 1e-12])
 @pytest.mark.parametrize("held", [False, True])

@@ -229,7 +229,7 @@ def exact_eigenvalues(M, D, K):
         return mpmath.eig(A, left=False, right=False)
 
 
-@pytest.mark.thorough(every=5)
+@pytest.mark.thorough(every=9)
 @pytest.mark.parametrize("batch", range(10))
 def test_random_systems_over_twelve_decades(batch):
     rng, decided, digits = np.random.default_rng(batch), [], []

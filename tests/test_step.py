@@ -156,17 +156,6 @@ def test_quaternions_stay_of_unit_length_over_many_steps() -> None:
         assert abs(np.linalg.norm(q[start : start + 4]) - 1) < 4 * EPS
 
 
-def test_many_steps_are_a_run() -> None:
-    dyn = own(mb.load("ur5"))
-    q, v, tau = states(dyn.model)
-    run = simulate(dyn, q, 0.1 * v, 0.1, dt=1e-3, torque=tau)
-    v = 0.1 * v
-    for k in range(100):
-        q, v = dyn.step(q, v, tau, 1e-3)
-        np.testing.assert_array_equal(q, run.q[k + 1])
-        np.testing.assert_array_equal(v, run.v[k + 1])
-
-
 def test_nothing_is_shared_and_arguments_stay_as_they_are() -> None:
     dyn = own(tumbling())
     for arguments in (states(dyn.model), states(dyn.model, 3)):

@@ -90,6 +90,7 @@ def test_runs_and_steps_begin_where_one_joint_holds_back(engine: str, method: st
         assert dyn.step(still, still, PULL, 0.01, method)[1] == pytest.approx([0, -0.02 / 0.21], rel=1e-12)
 
 
+@pytest.mark.thorough("1", "2", "4")
 @pytest.mark.parametrize("seed", range(6))
 def test_accelerations_at_rest_are_those_of_a_consistent_pattern(seed: int) -> None:
     """Each of 3,600 states is held against all 3^n patterns."""
@@ -128,6 +129,7 @@ def test_one_joint_holds_wherever_it_can_and_then_has_the_friction_of_motion() -
     assert a[:, 0] == pytest.approx([0.0, 1.5, -1.5], rel=1e-15)
 
 
+@pytest.mark.thorough("1")
 @pytest.mark.parametrize("seed", range(2))
 def test_of_several_patterns_it_is_that_of_a_stribeck_velocity_that_goes_to_zero(seed: int) -> None:
     """The curve is followed by implicit steps in v / v_s, with v_s of all joints alike; 1 in 100 may differ."""

@@ -432,6 +432,7 @@ def test_conditions_beyond_double_are_known():
 # How it is asked
 
 
+@pytest.mark.thorough("processes")
 @pytest.mark.parametrize("pool", [ThreadPoolExecutor, spawning], ids=["threads", "processes"])
 def test_an_executor_finds_the_same_errors(pool):
     given = {"engines": ["pinocchio"], "methods": ["rk4"], "values": (1e-3, 1e-2)}

@@ -243,20 +243,6 @@ def test_a_torque_function_acts_at_the_midpoint() -> None:
     assert set(times) == {0.05}
 
 
-def test_the_last_step_may_be_shorter_and_saved_states_are_those_of_the_whole_run() -> None:
-    model, q, v, _ = cases()["double pendulum"]
-    for dyn in (engine(model), engine(model, compile=True)):
-        whole = simulate(dyn, q, v, 1.003, METHOD, dt=0.01)
-        assert len(whole.t) == 102
-        assert whole.t[-1] == 1.003
-        some = simulate(dyn, q, v, 1.003, METHOD, dt=0.01, save=[0.5, 1.003])
-        assert np.array_equal(some.q, whole.q[[50, -1]])
-        end = simulate(dyn, whole.q[-2], whole.v[-2], 0.003, METHOD, dt=0.003)
-        assert end.q[-1] == pytest.approx(whole.q[-1], abs=1e-14)
-        nothing = simulate(dyn, q, v, 0.0, METHOD, dt=0.01)
-        assert np.array_equal(nothing.q, q[None])
-
-
 # What goes wrong
 
 

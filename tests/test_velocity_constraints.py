@@ -160,7 +160,7 @@ def made(seed: int, moving: bool) -> Lagrangian:
     )
 
 
-@pytest.mark.thorough(every=4)
+@pytest.mark.thorough(every=7)
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("moving", [False, True])
@@ -276,7 +276,9 @@ def eliminated(name: str) -> list[NonholonomicEquations]:
     return [getattr(lag, way)(rates) for way in WAYS]
 
 
-@pytest.mark.thorough("ball on a table", "suslov in numbers", "car", "disc in body rates", "heavy suslov")
+@pytest.mark.thorough(
+    "ball on a table", "suslov in numbers", "car", "disc in body rates", "heavy suslov", "suslov", "disc"
+)
 @pytest.mark.parametrize("name", ON_ONE_PAGE)
 def test_the_three_eliminations_print_the_same_text(name) -> None:
     made = eliminated(name)

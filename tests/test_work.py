@@ -24,6 +24,7 @@ def rubbing(**joint: Any) -> Model:
     return block(friction=3.0, **joint).build(point_masses=True)
 
 
+@pytest.mark.thorough("save1")
 @pytest.mark.parametrize("save", [None, [0.0, 0.7, 1.5]])
 def test_the_way_back_and_forth_counts_between_saved_states_too(save: Any) -> None:
     """From turn to turn the swing on a spring shrinks by 2 f/k, until the spring cannot pull the block."""
@@ -101,6 +102,7 @@ def written(system: Callable[[], Any], h: float) -> Trajectory:
     return simulate(system().dynamics(), [1.0], [0.5], 0.5, dt=h / 10)
 
 
+@pytest.mark.thorough("<lambda>1")
 @pytest.mark.parametrize(
     "run",
     [

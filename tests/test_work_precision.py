@@ -30,7 +30,7 @@ from mbkit.studies import InterruptedSweepError, Reference, work_precision
 from mbkit.studies.measurement import Measurement
 from mbkit.studies.work_precision.curve import Curve, gains_nothing, observed_order
 from mbkit.studies.work_precision.result import WorkPrecision
-from mbkit.studies.work_precision.sweep import CurveMeasurement, _without_heyoka_cache, first_run, plans, repetitions
+from mbkit.studies.work_precision.sweep import CurveMeasurement, _without_heyoka_cache, plans, repetitions
 from tests.scenes import chain, hinge, slider
 
 FIXED = [m.name for m in METHODS.values() if m.kind != "adaptive"]
@@ -166,21 +166,6 @@ def test_coarse_tolerances_that_bind_no_step_do_not_end_a_grid():
         assert (a.steps, a.evaluations) != (b.steps, b.evaluations)
 
 
-@pytest.mark.thorough
-def test_a_slow_machine_measures_the_same_points(monkeypatch):
-    def few_runs():
-        return study(("pinocchio", "mujoco"), ("rk4", "rk853", "mujoco_rk4"), steps=None, tolerances=None, work=4000)
-
-    set_clock(monkeypatch, seconds_per_look=1e-4)
-    quick = few_runs()
-    set_clock(monkeypatch, seconds_per_look=40e-4)
-    assert errors(few_runs()) == errors(quick)
-    assert quick.shortened == ("runs of up to 4,000 evaluations alone",)
-    # Work is counted, and a call from Python counts eight.
-    assert max(8 * p.evaluations for c, p in quick.rows() if c.engine == "pinocchio") <= 4000
-    assert 2000 < max(p.evaluations for c, p in quick.rows() if c.method == "mujoco_rk4") <= 4000
-
-
 def test_the_same_seed_gives_the_same_errors_to_the_bit_and_another_starts_elsewhere():
     for name in ("pinocchio", "lagrangian", "mujoco"):
         one, two = (study([name], ["rk4", "rk853"], steps=[0.05, 0.025], seed=3) for _ in range(2))
@@ -224,25 +209,6 @@ def test_what_is_compiled_once_is_no_run_time_and_is_compiled_again_each_time(mo
         assert compiled
     assert in_runs == [0] * len(in_runs)
     assert len(in_runs) >= 4
-
-
-@pytest.mark.thorough("gauss4")
-@pytest.mark.parametrize("method", ["rk853", "dop853", "gauss4"])
-def test_nothing_that_is_kept_shortens_a_first_run(method, compiled):
-    model = mb.catalog.double_pendulum()
-
-    def first(dyn):
-        mb.simulate(dyn, [0.1, 0.2], [0.0, 0.0], 1e-3, method, save=[1e-3])
-
-    counts = []
-    for _ in range(3):
-        compiled.clear()
-        assert first_run(model, "lagrangian", method, first)[1] >= 0
-        counts.append(len(compiled))
-    assert counts[1] == counts[2] > 0
-    compiled.clear()
-    first(mb.dynamics(model, "lagrangian"))
-    assert not compiled
 
 
 def test_a_step_too_large_is_noted_and_does_not_end_the_sweep():
@@ -503,22 +469,6 @@ def test_executors_find_the_same_errors(make, few):
     assert "share the cores" in result.settings["timing"]
 
 
-@pytest.mark.thorough
-def test_dasks_executor_finds_the_same_errors(few, tmp_path):
-    distributed = pytest.importorskip("distributed")
-    import dask
-
-    with (
-        # Its scratch folder is the test's own.
-        dask.config.set({"temporary-directory": str(tmp_path)}),
-        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
-        distributed.Client(cluster) as client,
-        client.get_executor() as executor,
-    ):
-        result = study(("pinocchio", "mujoco"), ("rk4", "dop853"), executor=executor, seconds=1e4)
-    assert errors(result) == errors(few)
-
-
 def die_elsewhere(_t, _q, _v):
     """A torque that ends any process but the first."""
     if multiprocessing.parent_process() is not None:
@@ -709,17 +659,6 @@ def test_results_survive_json_and_csv(result):
         assert (row["engine"], row["method"], row["note"]) == said
         assert row["error"] == ("" if math.isnan(point.error) else repr(point.error))
     assert sum(int(r["front"]) for r in rows) == len(result.front)
-
-
-@pytest.mark.parametrize(
-    "change", [lambda d: d.pop("floor"), lambda d: d.update(curves=3), lambda d: d.update(curves=[{}])]
-)
-def test_what_is_no_result_is_refused(change, few):
-    data = json.loads(few.to_json())
-    change(data)
-    for text in (json.dumps(data), "", "[]", "[" * 100_000, few.to_json()[:200], None):
-        with pytest.raises(InputError, match="text: expected the JSON of a WorkPrecision"):
-            WorkPrecision.from_json(text)
 
 
 @pytest.mark.parametrize("error", [math.nan, 20.0])
