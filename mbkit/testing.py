@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import unittest
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from mbkit.model import Model
     from mbkit.studies.baseline import BaselineResult
     from mbkit.studies.compare.result import Comparison
-    from mbkit.studies.compare.rows import Row
     from mbkit.studies.explain import Explanation
     from mbkit.studies.lint import LintFinding, LintResult
 
@@ -70,6 +70,7 @@ def assert_engines_agree(
     __tracebackhide__ = True
     from mbkit.studies import compare
     from mbkit.studies._targets import not_installed
+    from mbkit.studies.document import to_text
 
     missing = {} if isinstance(engines, str) else not_installed(engines)
     present = [name for name in engines if name not in missing]
@@ -79,10 +80,16 @@ def assert_engines_agree(
     if missing and len(present) < 2:
         raise unittest.SkipTest(message)
     result = compare(model, present if missing else engines, samples, seed, tolerance=rtol, terms_only=True)
-    refused = [r for r in result.refusals if not r.term]
-    failed = [r for r in result.rows if not r.passed]
-    if failed or refused or not result.passed:
-        raise AssertionError(_comparison_text(result, failed, [f"{r.engine} refuses it: {r.reason}" for r in refused]))
+    if not result.passed or any(not r.term for r in result.refusals):
+        lines = [to_text(result.document(full=False), _MAX_LISTED_LINES)]
+        if worst := result.worst:
+            lines.append(f"  worst state ({worst.worst_kind}): q = {list(worst.worst_q)}, v = {list(worst.worst_v)}")
+        packages = ((e, find_engine(e).distribution) for e in result.engines)
+        # A user's own engine goes by its own name.
+        versions = (f"{x} {result.versions[x]}" if x in result.versions else e for e, x in packages)
+        lines.append(f"  {', '.join(versions)}")
+        lines.append(f"  to see it all: mbkit.compare(model, {result.engines}, {result.samples}, {result.seed})")
+        raise AssertionError("\n".join(lines))
     return result
 
 
@@ -115,12 +122,13 @@ def assert_same_dynamics(
     True
     """
     __tracebackhide__ = True
+    from mbkit.studies.document import to_text
     from mbkit.studies.explain import explain
 
     names = (model_a.name, model_b.name) if model_a.name != model_b.name else ("model_a", "model_b")
     result = explain(model_a, model_b, samples=samples, seed=seed, tolerance=rtol, names=names)
     if not result.agree:
-        raise AssertionError(_explanation_text(result))
+        raise AssertionError(to_text(result.document(), _MAX_LISTED_LINES))
     return result
 
 
@@ -149,6 +157,7 @@ def assert_plausible(
     False
     """
     __tracebackhide__ = True
+    from mbkit.studies.document import to_text
     from mbkit.studies.lint import lint
     from mbkit.studies.lint.result import LOOK
 
@@ -162,8 +171,7 @@ def assert_plausible(
 
     wrong = [row for row in result.rows if row.confidence != LOOK and not known(row)]
     if wrong:
-        lines = _first([f"{row}; expected {row.expected}" for row in wrong], "")
-        raise AssertionError("\n".join([f"{result.model}: {len(wrong)} findings that are sure or likely", *lines]))
+        raise AssertionError(to_text(replace(result, rows=tuple(wrong)).document(), _MAX_LISTED_LINES))
     return result
 
 
@@ -216,39 +224,3 @@ def assert_baseline(
 
 def _strict(strict: bool | None) -> bool:
     return os.environ.get(STRICT, "0") not in ("", "0") if strict is None else strict
-
-
-def _first(texts: Sequence[str], rest: str) -> list[str]:
-    more = len(texts) - _MAX_LISTED_LINES
-    return [f"  {text}" for text in texts[:_MAX_LISTED_LINES]] + ([f"  and {more} more{rest}"] if more > 0 else [])
-
-
-def _comparison_text(result: Comparison, failed: Sequence[Row], refused: Iterable[str]) -> str:
-    off = f"{len(failed)} of {len(result.rows)} comparisons are off by more than {result.tolerance:.0e}"
-    lines = [f"{result.model}: {result.verdict if result.nothing else off}"]
-    worst = sorted(failed, key=lambda r: -r.relative)
-    lines += _first([f"{r.engine}, {r.term}: {r.reason}" for r in worst], "")
-    lines += [f"  {reason}" for reason in refused]
-    if worst and worst[0].worst_q:
-        lines.append(f"  worst state ({worst[0].worst_kind}): q = {_numbers(worst[0].worst_q)}")
-        lines.append(f"                v = {_numbers(worst[0].worst_v)}")
-    packages = ((e, find_engine(e).distribution) for e in result.engines)
-    # A user's own engine goes by its own name.
-    versions = (f"{package} {result.versions[package]}" if package in result.versions else e for e, package in packages)
-    lines.append(f"  {', '.join(versions)}")
-    lines.append(f"  to see it all: mbkit.compare(model, {result.engines}, {result.samples}, {result.seed})")
-    return "\n".join(lines)
-
-
-def _explanation_text(result: Explanation) -> str:
-    apart = [g for g in result.gaps if g.relative > result.tolerance]
-    lines = [f"{result.verdict} (rtol {result.tolerance:.0e})"]
-    lines += [f"  {g.term} at {g.joint or 'no single joint'}: off by {g.relative:.1e}" for g in apart]
-    lines += _first([f"cause: {c.says}" for c in result.acting], " causes")
-    sides = ((result.only_a, result.a), (result.only_b, result.b))
-    lines += [f"  only in {side}: {', '.join(names)}" for names, side in sides if names]
-    return "\n".join([*lines, *(f"  note: {note}" for note in result.notes)])
-
-
-def _numbers(x: Sequence[float]) -> str:
-    return f"[{', '.join(f'{a:.6g}' for a in x)}]"

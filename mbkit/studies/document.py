@@ -225,6 +225,20 @@ def to_html(shown: Document) -> str:
     return "".join(parts)
 
 
+def to_text(shown: Document, most: int = 0) -> str:
+    """Return what a document says everywhere, as lines; of a list or table at most so many."""
+    lines = [f"{shown.name}: {shown.verdict}"]
+    for block in (block for _, blocks in shown.shown("both") for block in blocks):
+        texts = [block.text] if isinstance(block, Paragraph) else []
+        if isinstance(block, Items):
+            texts = [bullet.line for bullet in block.bullets]
+        elif isinstance(block, Table):
+            texts = [", ".join(filter(None, row)) for row in _texts(block, "both")][1:]
+        lines += [f"  {plain(text)}" for text in texts[: most or None]]
+        lines += [f"  and {len(texts) - most} more"] if most and len(texts) > most else []
+    return "\n".join(lines)
+
+
 def block_markdown(block: Block) -> str:
     """Return a block in Markdown; empty for what Markdown does not show."""
     if isinstance(block, Paragraph):

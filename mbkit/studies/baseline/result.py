@@ -9,7 +9,7 @@ from typing import Final, Literal
 import numpy as np
 
 from mbkit.studies.baseline.description import Change
-from mbkit.studies.document import Bullet, Document, Items, Style
+from mbkit.studies.document import Bullet, Document, Items, Style, to_text
 from mbkit.studies.results import Refusal, ResultTable, columns_of, counted
 
 Status = Literal["same", "versions", "numbers", "description", "skipped"]
@@ -164,13 +164,7 @@ class BaselineResult(ResultTable):
 
     def text(self, remedy: str = "") -> str:
         """Return everything for a terminal without colours; `remedy` is the command that records again."""
-        head = f"{self.model}, {self.path}: {self.verdict}"
-        if self.question == "diff":
-            head = f"{self.path} → {self.against}: {self.verdict}"
-        out = [head, *(f"  {what}: {text}" for what, text in self.lines())]
-        if self.status in ("description", "numbers") and self.question == "check" and remedy:
-            out.append(f"  If this is meant: {remedy}")
-        return "\n".join(out)
+        return to_text(self.document(remedy, full=False))
 
     _derived = ("passed", "verdict")
     _listed = "moved"
