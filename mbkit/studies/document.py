@@ -229,7 +229,7 @@ def to_text(shown: Document, most: int = 0) -> str:
     """Return what a document says everywhere, as lines; of a list or table at most so many."""
     lines = [f"{shown.name}: {shown.verdict}"]
     for block in (block for _, blocks in shown.shown("both") for block in blocks):
-        texts = [block.text] if isinstance(block, Paragraph) else []
+        texts: Sequence[Text] = [block.text] if isinstance(block, Paragraph) else []
         if isinstance(block, Items):
             texts = [bullet.line for bullet in block.bullets]
         elif isinstance(block, Table):

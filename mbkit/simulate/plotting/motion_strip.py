@@ -12,7 +12,7 @@ from mbkit._check import Array, count
 from mbkit.errors import InputError
 from mbkit.model import Model
 from mbkit.simulate.plotting.stick_figure import Skeleton, direction_name, plane_of, skeleton
-from mbkit.simulate.plotting.style import PLAIN, drawing, figure_of
+from mbkit.simulate.plotting.style import PLAIN, drawing, figure_of, new_figure
 from mbkit.simulate.run_data import RunData, integrate_finite
 
 if TYPE_CHECKING:
@@ -160,10 +160,7 @@ def picture(
         most = tuple(np.array(axis.get_window_extent().size) / figure_of(axis).dpi)
     strip = _Strip(drawn, plane, seen @ plane.T, figures, most)
     with drawing(more={"font.size": 9.0}):
-        from matplotlib.figure import Figure
-
-        if axis is None:
-            axis = Figure(figsize=strip.size, layout="constrained").add_subplot()
+        axis = axis or new_figure(*strip.size).add_subplot()
         for k in range(figures):
             strip.draw(axis, k, float(at[k * _FINE]), max(k - 1, 0) * _FINE, k * _FINE)
         strip.frame(axis)

@@ -86,6 +86,14 @@ def drawing(palette: Palette = PLAIN, more: Mapping[str, Any] | None = None) -> 
     return rc_context(settings)
 
 
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure, sized in inches: without pyplot, so no window system, and nothing to close."""
+    with needed("matplotlib", "a figure"):
+        from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
 def figure_of(ax: Axes) -> Figure:
     """Return the whole figure of an axes, also of one in a subfigure."""
     from matplotlib.figure import Figure

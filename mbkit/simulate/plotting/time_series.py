@@ -13,7 +13,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.errors import InputError, MbkitError
 from mbkit.model import Model
-from mbkit.simulate.plotting.style import PLAIN, drawing
+from mbkit.simulate.plotting.style import PLAIN, drawing, new_figure
 from mbkit.simulate.run_data import RunData
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def plot(run: RunData, fig: Figure | SubFigure | None = None) -> Figure:
     forces = _forces(run)
     rows = len(panels) + 1 + (len(forces) > 0)
     with drawing(more=_SIZES), np.errstate(over="ignore", invalid="ignore"):
-        fig = fig or _figure(rows)
+        fig = fig or new_figure(11, 0.6 + 2.2 * rows)
         axes = fig.subplots(rows, 2, sharex=True, squeeze=False)
         names, speeds = run.model.coordinate_names, run.model.velocity_names
         for (left, right), ((title, unit, rate), q, v) in zip(axes, panels, strict=False):
@@ -120,7 +120,7 @@ def plot_csv(text: str, title: str) -> Figure:
             f"expected the table of a trajectory (t, q.NAME, ..., v.NAME, ...), which mbkit simulate writes; {error}"
         ) from None
     with drawing(more=_SIZES):
-        fig = _figure(2)
+        fig = new_figure(11, 5.0)
         axes = fig.subplots(2, 1, sharex=True)
         for axis, kind, label in zip(axes, "qv", ("q (m or rad)", "v (m/s or rad/s)"), strict=True):
             which = [k for k, name in enumerate(names, 1) if name.startswith(f"{kind}.")]
@@ -128,13 +128,6 @@ def plot_csv(text: str, title: str) -> Figure:
         axes[-1].set_xlabel("t (s)")
         fig.suptitle(title, fontsize=11)
     return fig
-
-
-def _figure(rows: int) -> Figure:
-    # Figure without pyplot: no window system, nothing to close.
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(11, 0.6 + 2.2 * rows), layout="constrained")
 
 
 def _whole(fig: Figure | SubFigure) -> Figure:

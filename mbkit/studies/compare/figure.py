@@ -17,6 +17,7 @@ from mbkit.simulate.plotting.style import (
     legend,
     log_ticks,
     name_points,
+    new_figure,
 )
 from mbkit.studies.compare.rows import Row, by_term
 from mbkit.studies.formatting import error_text, time_text
@@ -39,12 +40,9 @@ def figure(
     ax: Axes | None = None,
 ) -> Figure:
     """Draw the digits of agreement of each term and engine, in the style that is set."""
-    from matplotlib.figure import Figure
-
     terms = by_term(rows)
     own = ax is None
-    if ax is None:
-        ax = Figure(figsize=(7.2, 1.3 + 0.36 * len(terms)), layout="constrained").add_subplot()
+    ax = ax or new_figure(7.2, 1.3 + 0.36 * len(terms)).add_subplot()
     step = 0.8 / max(len(engines), 3)
     for k, engine in enumerate(engines):
         colour, label = palette.engine(engine), f"{one_line(engine, 30)} against {reference}"

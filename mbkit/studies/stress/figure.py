@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mbkit._escape import one_line
 from mbkit.errors import require_known
-from mbkit.simulate.plotting.style import PLAIN, Palette, drawing, engine_mark, figure_of, legend
+from mbkit.simulate.plotting.style import PLAIN, Palette, drawing, engine_mark, figure_of, legend, new_figure
 from mbkit.studies.measurement import Measurement, Outcome
 from mbkit.studies.stress.measurements import CaseResult, engines_of
 from mbkit.studies.svg import PAGE_WIDTH_INCHES
@@ -104,11 +104,7 @@ def figure(
 
 def _axes(ax: Axes | None, rows: int, height: float) -> Axes:
     """Return axes with so many rows of a height, in; in a new figure where none is given."""
-    # Figure without pyplot: no window system, nothing to close.
-    from matplotlib.figure import Figure
-
-    size = PAGE_WIDTH_INCHES, 1.5 + height * max(rows, 1)
-    ax = ax or Figure(figsize=size, layout="constrained").add_subplot()
+    ax = ax or new_figure(PAGE_WIDTH_INCHES, 1.5 + height * max(rows, 1)).add_subplot()
     ax.set_ylim(max(rows, 1) - 0.5, -0.5)
     return ax
 

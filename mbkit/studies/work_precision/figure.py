@@ -19,6 +19,7 @@ from mbkit.simulate.plotting.style import (
     legend,
     log_ticks,
     name_points,
+    new_figure,
 )
 from mbkit.studies.measurement import Measurement
 from mbkit.studies.svg import PAGE_WIDTH_INCHES
@@ -54,9 +55,6 @@ def figure(
     are drawn into the axes `only`. The floor says how well the reference is known, rad or m.
     """
     with drawing(palette):
-        # Figure without pyplot: no window system, nothing to close.
-        from matplotlib.figure import Figure
-
         drawn = _Drawing(curves, duration, floor if math.isfinite(floor) and floor > 0 else 0.0, palette)
         if only is not None:
             drawn.errors(only, own=False)
@@ -64,7 +62,7 @@ def figure(
         methods = drawn.methods()
         rows = math.ceil(len(methods) / _PANELS_PER_ROW)
         heights = [_TOP_HEIGHT_INCHES, *([0.3 + _PANEL_HEIGHT_INCHES * rows] if rows else [])]
-        fig = Figure(figsize=(PAGE_WIDTH_INCHES, sum(heights)), layout="constrained")
+        fig = new_figure(PAGE_WIDTH_INCHES, sum(heights))
         parts = fig.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
         # With dampers the energy is not conserved, and there is no drift to show.
         conserved = bool(drawn.places(curves, lambda p: p.energy))
