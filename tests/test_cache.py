@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
 import stat
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -181,21 +179,6 @@ def test_many_writers_of_one_entry_leave_a_whole_one(folder):
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(write, range(64)))
     assert [p.name for p in folder.iterdir()] == ["a" * 64]
-
-
-@pytest.mark.thorough
-def test_processes_that_start_at_once_agree(folder):
-    code = (
-        "import json, numpy as np, mbkit as mb\n"
-        "m = mb.catalog.chain(n=3)\n"
-        "d = mb.dynamics(m, 'lagrangian', compile=True)\n"
-        "q = np.linspace(0, 1, 3)\n"
-        "print(json.dumps([x.hex() for x in d.forward_dynamics(q, q, q)]))\n"
-    )
-    running = [subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) for _ in range(3)]
-    out = {tuple(json.loads(p.communicate(timeout=120)[0])) for p in running}
-    assert len(out) == 1
-    assert not [p for p in folder.iterdir() if p.name.startswith(".new-")]
 
 
 @pytest.mark.usefixtures("folder")

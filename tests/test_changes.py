@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import casadi as ca
-import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -723,27 +722,3 @@ def test_a_xacro_file_is_expanded_with_its_arguments(tmp_path):
         mb.load(file, xacro={"mass": 3})
     with pytest.raises(InputError, match="which is no"):
         mb.load("ur5", xacro={"mass": "3"})
-
-
-# Pictures
-
-
-def test_an_edited_and_a_joined_robot_are_drawn_with_their_shapes():
-    from mbkit.show.scene import shapes_of
-
-    robot = mb.load("ur5")
-    b = mb.ModelBuilder.of(robot)
-    b.add_payload("load", at="tool0", mass=2.0, inertia=(0.01, 0.01, 0.01))
-    whole = mb.join(b.build(), robot, at="load", prefix="second_")
-    shapes = shapes_of(whole)
-    plain = [x.name for x in shapes_of(robot)]
-    assert [x.name for x in shapes][: 2 * len(plain)] == [*plain, *(f"second_{x}" for x in plain)]
-    assert {"load"} <= {x.body for x in shapes}
-    assert mujoco.mj_name2id(
-        mb.dynamics(whole, "mujoco").mj_model, mujoco.mjtObj.mjOBJ_BODY, "second_forearm_link"
-    ) > 0  # fmt: skip
-
-
-def test_a_name_that_is_unknown_is_told_of_every_change():
-    with pytest.raises(UnknownNameError, match="hinge"):
-        pendulum().build().lock({"hinges": 0.0})

@@ -5,8 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import pickle
-import re
 import sys
 import warnings
 from dataclasses import replace
@@ -26,7 +24,7 @@ from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.pinocchio.engine import PinocchioDynamics
 from mbkit.engines.registry import find_engine
-from mbkit.errors import InputError, NumericalError, OutputError, UnknownNameError
+from mbkit.errors import InputError, NumericalError, UnknownNameError
 from mbkit.studies.compare import beyond_terms
 from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
 from mbkit.studies.compare.beyond_terms import rollouts
@@ -491,36 +489,6 @@ def test_one_engine_alone_agrees_with_the_reference():
     result = mb.compare(model, ("lagrangian", "mujoco"), 1, terms_only=True)
     assert result.passed
     assert f"lagrangian agrees with the {result.reference}" in result.verdict
-
-
-@pytest.mark.thorough
-@pytest.mark.usefixtures("of_motion")
-def test_a_refused_body_is_named_and_the_others_are_compared():
-    with pytest.warns(mb.errors.NonPhysicalWarning):
-        model = mb.load("icub")
-    result = terms(model)
-    assert result.passed
-    assert result.engines == ("pinocchio", "lagrangian")
-    refusal = next(r for r in result.refusals if r.engine == "mujoco")
-    assert "body 'r_upper_leg'" in refusal.reason
-    assert "A + B >= C" in refusal.reason
-
-
-def test_results_can_be_kept(tmp_path):
-    result = terms(mb.load("ur5"), seed=3)
-    data = json.loads(result.to_json(tmp_path / "r.json"))
-    assert data == json.loads((tmp_path / "r.json").read_text())
-    assert data["passed"] is True
-    assert data["seed"] == 3
-    assert data["versions"]["pin"]
-    assert len(data["rows"][0]["worst_q"]) == 6
-    assert pickle.loads(pickle.dumps(result)).to_json() == result.to_json()
-    # A term stands once, before its first engine.
-    engines = r"\| forward dynamics \| pinocchio \|.*\n\| \| lagrangian \|.*\n\| \| mujoco \|"
-    assert re.search(engines, result.to_markdown())
-    assert "<script>" not in replace(result, model="<script>")._repr_html_()
-    with pytest.raises(OutputError, match="result itself is kept"):
-        result.to_json(tmp_path / "r.json" / "below_a_file.json")
 
 
 @pytest.mark.usefixtures("of_motion")

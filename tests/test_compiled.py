@@ -553,15 +553,6 @@ def test_levels_that_are_none_are_refused(monkeypatch: pytest.MonkeyPatch) -> No
         jit.host_of("x86-64-v9")
 
 
-def test_a_command_refuses_a_level_that_is_none() -> None:
-    """It is no engine that failed: a comparison without it would be a success of less than was asked."""
-    code = "from mbkit.cli import main; main()"
-    env = {**os.environ, "MBKIT_CPU": "x86-64-v9"}
-    done = subprocess.run([sys.executable, "-c", code, "robots"], env=env, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert "MBKIT_CPU: expected a level" in done.stderr
-
-
 def test_a_fork_waits_for_locks_that_a_thread_takes_in_any_order():
     older, newer = (_fork.fork_safe(threading.RLock()) for _ in range(2))
     done, begun = threading.Event(), threading.Event()

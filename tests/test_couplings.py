@@ -3,7 +3,6 @@
 # ruff: noqa: E501 -- a description is easier to read on one line
 from __future__ import annotations
 
-import pickle
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -16,11 +15,9 @@ import pytest
 import mbkit as mb
 from mbkit.derivation import Equations
 from mbkit.derivation.mass_matrix_solve import elimination_order, elimination_size
-from mbkit.engines.mujoco import importer
 from mbkit.errors import KnownDefectWarning, ModelError, UnsupportedError
 from mbkit.model import JointCoupling, Model, ModelBuilder
 from mbkit.model.validation import sample_mass_matrix
-from mbkit.studies.baseline.description import described
 from tests.random_trees import ALL, SOUND, random_tree
 
 EPS = np.finfo(float).eps
@@ -402,48 +399,7 @@ def test_a_rotor_may_be_all_that_a_joint_moves():
     assert not b.build().nonphysical
 
 
-@pytest.mark.parametrize("method", ["rk4", "implicit_midpoint", "rodas5"])
-def test_methods_that_eliminate_by_themselves_keep_the_energy(method):
-    dyn = mb.dynamics(two_pendulums(stiffness=3.0, rest_length=0.2, armature=0.5).build(), "lagrangian", compile=False)
-    step = {"rtol": 1e-9} if method == "rodas5" else {"dt": 2e-3}
-    run = mb.simulate(dyn, [0.3, 0.1], [0.0, 0.0], 0.5, method=method, **step)
-    assert np.ptp(run.energy()) < 1e-7
-    assert np.abs(run.v[-1]).min() > 0.1
-
-
 # The description.
-
-
-def test_parameters_of_a_coupling():
-    k, f = mb.Parameter("k", 2.0), mb.Parameter("f")
-    b = two_pendulums()
-    b.add_coupling("p", {"j0": f, "j1": 1.0}, stiffness=k, rest_length=f * k, damping=k, armature=k)
-    model = b.build()
-    dyn = mb.dynamics(model, "lagrangian", compile=False).at(f=0.3, k=1.5)
-    fixed = mb.dynamics(model.with_parameters(f=0.3, k=1.5), "pinocchio")
-    q, v, tau = np.random.default_rng(0).normal(size=(3, 2))
-    assert_near(dyn.forward_dynamics(q, v, tau), fixed.forward_dynamics(q, v, tau))
-    assert_near(dyn.potential_energy(q), fixed.potential_energy(q))
-
-
-def test_features_and_identity():
-    model = two_pendulums(stiffness=3.0, damping=0.5, armature=0.5).build()
-    bare = replace(model, couplings=())
-    needs = model.needs
-    assert model.needs.damping
-    assert not model.without("damping").needs.damping
-    assert needs.springs
-    assert needs.damping
-    assert needs.armature
-    assert not bare.needs.springs
-    for feature, field in (("springs", "stiffness"), ("damping", "damping"), ("armature", "armature")):
-        (left,) = model.without(feature).couplings
-        assert [n for n in ("stiffness", "damping", "armature") if not getattr(left, n)] == [field]
-    assert model.without("springs", "damping", "armature") == bare
-    assert pickle.loads(pickle.dumps(model)) == model != bare
-    assert len({model.digest, bare.digest, model.without("springs").digest}) == 3
-    assert "c" in repr(model).split("couplings")[1]
-    assert "coupling 'c'" in model._repr_html_().replace("&#x27;", "'")
 
 
 def test_faults_of_a_coupling():
@@ -460,20 +416,6 @@ def test_faults_of_a_coupling():
         assert words in faults
 
 
-def test_written_and_read_again(tmp_path):
-    model, _ = coupled_tree(1, ("revolute", "prismatic"), deep=True)
-    made = mb.convert(model, "mjcf")
-    assert made.worst < 1e-11
-    again = loaded(tmp_path, made.text)
-    q, v = model.random_state(np.random.default_rng(0))
-    one, other = (mb.dynamics(m, "pinocchio") for m in (model, again))
-    assert {c.name for c in again.couplings} == {c.name for c in model.couplings}
-    assert_near(one.mass_matrix(q), other.mass_matrix(q))
-    assert_near(one.passive(q, v), other.passive(q, v))
-    with pytest.raises(UnsupportedError, match="'c'"):
-        mb.convert(two_pendulums(damping=1.0).build(), "urdf")
-
-
 def test_couplings_of_renamed_joints_are_the_same():
     model, other = (two_pendulums(joint=name, stiffness=2.0, armature=0.5).build() for name in ("j", "hinge"))
     found = mb.explain(model, other)
@@ -487,25 +429,3 @@ def test_a_rotor_that_an_engine_loses_is_named():
     (cause,) = found.causes
     assert cause.kind == "joint coupling"
     assert "branches" in str(cause)
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_the_importer_of_mujoco_reads_the_same(seed, tmp_path):
-    text = random_transmissions(seed)
-    model, imported = loaded(tmp_path, text), importer.read(text, "mjcf").model
-    q, v = model.random_state(np.random.default_rng(seed))
-    one, other = (mb.dynamics(m, "pinocchio") for m in (model.without("springs", "damping"), imported))
-    assert_near(one.mass_matrix(q), other.mass_matrix(q))
-    if not any(f'{part}="disable"' in text for part in ("spring", "damper")):
-        # The importer does not look at what flags do to joints.
-        assert_near(mb.dynamics(model, "pinocchio").passive(q, v), other.passive(q, v))
-    assert [c.name for c in model.couplings] == [c.name for c in imported.couplings]
-    assert [s.name for s in model.springs] == [s.name for s in imported.springs]
-
-
-def test_a_difference_in_a_coupling_is_named():
-    model, other = (two_pendulums(armature=x).build() for x in (0.5, 0.75))
-    (cause,) = mb.explain(model, other).causes
-    assert cause.acts
-    assert "'c'" in cause.subject
-    assert described(model)["couplings"]["c"]["armature"] == 0.5

@@ -34,25 +34,6 @@ def test_a_free_body_reads_in_newtons_and_eulers_equations():
     assert r"\dot{\theta} &= \omega_{2} \cos {\phi}" in derive("free_body", "--latex").stdout
 
 
-def test_a_cart_pole_reads_as_in_a_textbook():
-    text = derive("cart_pole").stdout
-    assert "T = ½ (m_c + m_p) ẋ² + m_p l ẋ θ̇ cos θ + ½ m_p l² θ̇²\n" in text
-    assert "V = -m_p g l cos θ\n" in text
-    assert "  (m_c + m_p) ẍ + m_p l θ̈ cos θ - m_p l θ̇² sin θ = 0\n" in text
-    assert "  m_p l ẍ cos θ + m_p l² θ̈ + m_p g l sin θ = 0\n" in text
-    assert "Cyclic: x\nConserved: p_x = (m_c + m_p) ẋ + m_p l θ̇ cos θ\nConserved: E = T + V\n" in text
-
-
-def test_a_double_pendulum_reads_as_in_a_textbook():
-    out = derive("double_pendulum")
-    assert "  ⎣ m₂ l₂ (l₂ + l₁ cos θ₂)                       m₂ l₂²                 ⎦\n" in out.stdout
-    assert "V = -(m₁ + m₂) g l₁ cos θ₁ - m₂ g l₂ cos(θ₁ + θ₂)\n" in out.stdout
-    last = "  m₂ l₂ (l₂ + l₁ cos θ₂) θ̈₁ + m₂ l₂² θ̈₂ + m₂ l₁ l₂ θ̇₁² sin θ₂ + m₂ g l₂ sin(θ₁ + θ₂) = 0\n"
-    assert last in out.stdout
-    # The name is a robot's too.
-    assert "note" in out.stderr
-
-
 def test_a_slider_crank_reads_as_in_a_textbook():
     text = derive("slider_crank").stdout
     assert "T = ½ m r² (1 + r cos θ/ρ)² θ̇² sin² θ\n" in text

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import pickle
 from typing import Any
 
 import casadi as ca
@@ -262,51 +261,6 @@ def test_wrenches_of_a_run_stand_beside_a_force_of_the_time() -> None:
 # The description
 
 
-def test_a_description_with_forces_is_plain_data() -> None:
-    again = pickle.loads(pickle.dumps(MODEL))
-    assert again == MODEL
-    assert again.digest == all_elements().digest
-    bare = MODEL.without("forces")
-    assert bare == tree().build()
-    assert (MODEL.needs.forces, bare.needs.forces) == (True, False)
-    assert (MODEL.needs.time, bare.needs.time) == (True, False)
-    assert MODEL.time_parameter == "t"
-    assert bare.time_parameter is None
-    assert "bushing &#x27;rubber&#x27; between" in MODEL._repr_html_()
-    b = tree()
-    b.add_joint_force("f", "elbow", lambda _t, q, _v: -q)
-    one = b.build()
-    b = tree()
-    b.add_joint_force("f", "elbow", lambda _t, q, _v: -2 * q)
-    assert one.digest != b.build().digest
-
-
-def test_parameters_of_forces_are_those_of_the_model() -> None:
-    assert dict(MODEL.parameters) == {"k": 2.0, "M": 0.2, "t": 0.0}
-    dyn = mb.dynamics(MODEL, "lagrangian")
-    fixed = MODEL.with_parameters(k=3.0, M=0.1)
-    assert list(fixed.parameters) == ["t"]
-    exact = mb.dynamics(fixed, "oracle").passive(Q, V)
-    assert off(dyn.at(k=3.0, M=0.1).passive(Q, V), exact) < 1e-13
-    assert off(mb.dynamics(MODEL, "pinocchio").at(k=3.0, M=0.1).passive(Q, V), exact) < 1e-13
-    many = dyn.at(k=np.array([1.0, 2.0, 3.0, 4.0]), M=0.1).passive(Q, V)
-    assert off(many[2], exact[2]) < 1e-13
-    # The law is linear in k: its slope is its difference.
-    by = dyn.parameter_derivatives("inverse_dynamics", Q, V, A)[..., 0]
-    change = dyn.at(k=2.5).inverse_dynamics(Q, V, A) - dyn.at(k=1.5).inverse_dynamics(Q, V, A)
-    assert off(by, change) < 1e-12
-
-
-def test_a_bushing_may_have_parameters_for_constants() -> None:
-    b = tree()
-    k = mb.Parameter("k", 3.0)
-    b.add_bushing("rubber", body_a="base", body_b="lower", stiffness=[k, k, k, k / 10, k / 10, k / 10], damping=k / 7)
-    model = b.build()
-    dyn = mb.dynamics(model, "lagrangian").at(k=5.0)
-    exact = mb.dynamics(model.with_parameters(k=5.0), "oracle").passive(Q, V)
-    assert off(dyn.passive(Q, V), exact) < 1e-13
-
-
 def test_joint_forces_are_written_out_in_symbols() -> None:
     def double() -> mb.ModelBuilder:
         b = mb.ModelBuilder("double")
@@ -397,20 +351,6 @@ def test_a_symbol_with_two_meanings_is_refused() -> None:
     assert mb.dynamics(b.build()).passive([1.0], [0.0]) == -2.0
 
 
-def test_what_does_not_know_forces_refuses_them_by_name() -> None:
-    q, v = MODEL.neutral(), np.zeros(MODEL.nv)
-    with pytest.raises(UnsupportedError, match=r"'motor'.*rk4"):
-        mb.simulate(mb.dynamics(MODEL, "mujoco"), q, v, 0.1, "mujoco_rk4")
-    for engine in ("lagrangian", "pinocchio", "oracle"):
-        dyn = mb.dynamics(MODEL, engine)
-        assert "joint_wrenches" not in dyn.supports
-        with pytest.raises(UnsupportedError, match="forces by functions"):
-            dyn.joint_wrenches(q, v, v)
-    for form in ("mjcf", "urdf"):
-        with pytest.raises(UnsupportedError, match="bushing 'rubber'"):
-            mb.convert(MODEL.with_parameters(k=1.0, M=1.0), form)
-
-
 def test_a_state_at_which_a_force_is_not_a_number_is_refused() -> None:
     b = tree()
     b.add_joint_force("f", "elbow", lambda _t, q, _v: -ca.sqrt(q))
@@ -420,10 +360,3 @@ def test_a_state_at_which_a_force_is_not_a_number_is_refused() -> None:
     for engine in ("lagrangian", "pinocchio", "mujoco"):
         with pytest.raises(mb.errors.NumericalError, match=engine):
             mb.dynamics(model, engine).forward_dynamics(q, np.zeros(model.nv), np.zeros(model.nv))
-
-
-def test_compare_judges_engines_with_forces() -> None:
-    fixed = MODEL.with_parameters(k=1.0, M=1.0)
-    result = mb.compare(fixed, engines=("pinocchio", "lagrangian", "mujoco"), samples=4, terms_only=True)
-    assert result.passed
-    assert {"passive", "potential energy", "power balance"} <= {row.term for row in result.rows}

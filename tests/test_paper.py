@@ -164,15 +164,6 @@ def test_the_blackboards_own_form():
     assert r"\ddot{\theta}_{1}" in lag.equations().latex()
 
 
-def test_dynamicsymbols_and_plain_ones_are_the_same_system():
-    q = dynamicsymbols("theta")
-    now = dynamicsymbols._t
-    lag = Lagrangian(m * l**2 * q.diff(now) ** 2 / 2, -m * g * l * sp.cos(q), [q], [q.diff(now)], parameters=VALUES)
-    assert (lag.T, lag.V, lag.coordinates, lag.velocities) == tuple(
-        getattr(pendulum(), n) for n in ("T", "V", "coordinates", "velocities")
-    )
-
-
 def test_lagranges_own_formula_gives_the_same_accelerations():
     """d/dt ∂L/∂q̇ - ∂L/∂q + ∂R/∂q̇ = 0 with functions of the time, and nothing of mbkit's; also in quasi-velocities."""
     lag, now = rheonomic(), dynamicsymbols._t
@@ -362,28 +353,6 @@ def test_parameters_move_without_deriving_again():
     assert mb.dynamics(plain, "lagrangian").gravity([1.0]) == pytest.approx(9.81 * 0.8 * np.sin(1.0), rel=1e-15)
     with pytest.raises(UnknownNameError):
         dyn.at(length=1.0)
-
-
-def test_it_travels():
-    dyn = driven().dynamics()
-    again = pickle.loads(pickle.dumps(dyn))
-    assert again.model == dyn.model
-    assert again.model.form_digest == dyn.model.form_digest != driven().substituted({m: 1}).model.form_digest
-    assert again.nle([1.0], [2.0]) == dyn.nle([1.0], [2.0])
-    run = mb.simulate(dyn, [1.0], [0.0], 0.1, "rk853", save=[0.0, 0.1])
-    assert np.array_equal(pickle.loads(pickle.dumps(run)).energy(), run.energy())
-
-
-def test_studies_take_it():
-    result = mb.compare(cart().model, samples=8, terms_only=True)
-    assert result.passed, result.verdict
-    assert result.engines == ("lagrangian",)
-    assert {r.engine for r in result.refusals} == {"pinocchio", "mujoco"}
-    study = mb.work_precision(
-        driven().model, methods=["rk4"], duration=0.2, steps=[0.02, 0.01, 0.005, 0.0025], repeats=1
-    )
-    rk4 = next(curve for curve in study.curves if curve.method == "rk4")
-    assert rk4.order == pytest.approx(4, abs=0.2)
 
 
 def test_functions_of_every_kind_are_converted():
@@ -582,22 +551,6 @@ def test_zero_is_told_by_value():
     assert hidden.cyclic_coordinates() == (th,)
 
 
-def test_without_damping_is_without_what_takes_energy():
-    model = cart().model
-    assert model.needs.damping
-    calm = model.without("damping")
-    assert not calm.needs.damping
-    assert mb.dynamics(calm, "lagrangian").passive([0.1, 0.2], [1.0, 1.0]) == pytest.approx([0.0, 0.0], abs=0)
-
-
-def test_it_shows_itself():
-    lag = pendulum()
-    assert "theta" in repr(lag)
-    assert lag.model._repr_html_()
-    assert lag._repr_latex_().startswith("$T = ")
-    assert lag.equations()._repr_latex_().startswith("$\\begin{aligned}")
-
-
 @pytest.mark.parametrize("study", [mb.dynamics, mb.compare, mb.work_precision, mb.convert], ids=lambda f: f.__name__)
 def test_what_takes_a_description_or_an_engine_says_where_paper_has_it(study) -> None:
     lag = pendulum()
@@ -606,15 +559,6 @@ def test_what_takes_a_description_or_an_engine_says_where_paper_has_it(study) ->
         study(lag, **more)
     with pytest.raises(InputError, match=r"dyn: expected a Dynamics, got Lagrangian; its \.dynamics\(\) makes one"):
         mb.simulate(lag, [0.1], [0.0], 1.0)
-
-
-def test_models_of_bodies_and_of_energies_answer_the_same_questions():
-    lag, robot = mb.lagrangian.systems.driven_pendulum(), mb.catalog.pendulum()
-    energies = lag.model
-    for model, expected in ((energies, (False, "t", None, False)), (robot, (True, None, None, False))):
-        assert (model.has_bodies, model.time_parameter, model.velocity_map, model.constrained) == expected
-    assert robot.energy_equations is None
-    assert energies.energy_equations("literal").form is lag
 
 
 def test_functions_that_are_not_given_stand_in_the_equation():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from math import atan, cos, cosh, pi, sin, sqrt, tanh
 from typing import Any
 
@@ -419,21 +418,6 @@ def test_a_wheel_in_a_plane_keeps_the_rows_that_say_something() -> None:
         assert dyn.constraint_names == ("no slip 'ground' forward velocity",)
         a = dyn.forward_dynamics(np.zeros(2), np.array([1.0, 2.0]), np.array([1.0, 0.0]))
         assert np.abs(a - np.array([1.0, 2.0]) / (3 + 0.2 * 4)).max() < 1e-15
-
-
-def test_a_description_carries_it_everywhere() -> None:
-    model = mb.catalog.bicycle()
-    assert model.needs.no_slip
-    assert pickle.loads(pickle.dumps(model)) == model
-    assert "no slip &#x27;front&#x27;: disc of radius 0.35 m" in model._repr_html_()
-    bare = model.without("no_slip")
-    assert not bare.constrained
-    assert not bare.needs.no_slip
-    assert len({model.digest, bare.digest, mb.catalog.bicycle(front_radius=0.34).digest}) == 3
-    copies = [pickle.loads(pickle.dumps(mb.dynamics(model, name))) for name in ("lagrangian", "pinocchio")]
-    q, v = model.random_state(0)
-    a, b = (dyn.forward_dynamics(q, v, np.zeros(9)) for dyn in copies)
-    assert np.abs(a - b).max() < 1e-11 * np.abs(a).max()
 
 
 # Refusals and faults

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from functools import cache
 
 import numpy as np
@@ -237,13 +236,6 @@ def test_reconstruction_from_arrays_and_of_the_ignored_alone():
     assert np.array_equal(told.v, again.v)
     batch = routhian.reduce(*(np.array([x, x]) for x in ([0.9, 0.2], [0.3, 1.5])))
     assert batch.values["p_phi"] == pytest.approx(start.values["p_phi"])
-
-
-def test_pickled():
-    routhian = spherical_pendulum().routhian()
-    start = routhian.reduce([0.9, 0.2], [0.3, 1.5])
-    again = pickle.loads(pickle.dumps(routhian))
-    assert again.reduce([0.9, 0.2], [0.3, 1.5]).values == start.values
 
 
 # What cannot be

@@ -557,14 +557,6 @@ def test_csv_holds_every_digit(tmp_path: Path) -> None:
         run.to_csv(tmp_path / "missing" / "run.csv")
 
 
-def test_plot_draws_both_and_closes_nothing(tmp_path: Path) -> None:
-    run = simulate(dynamics(catalog.double_pendulum()), [[0.1, 0.2], [0.3, 0.4]], [0.0, 0.0], 0.01)
-    figure = run.plot()
-    assert [len(axis.lines) for axis in figure.axes] == [4, 4, 2, 2]
-    figure.savefig(tmp_path / "run.png")
-    assert (tmp_path / "run.png").stat().st_size > 1000
-
-
 def test_progress_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     from mbkit.simulate import progress
 

@@ -231,16 +231,6 @@ def test_rest_that_the_time_does_not_move():
     assert not len(rest.frequencies)
 
 
-def test_rest_reads_well():
-    rest = equilibrium(mb.dynamics(mb.catalog.pendulum(), "pinocchio"), holding=[0.5])
-    assert "pendulum: equilibrium, stable" in str(rest)
-    assert "theta = 0.5" in str(rest)
-    assert "tau of" in str(rest)
-    assert "<table>" in rest._repr_html_()
-    with pytest.raises(ValueError, match="read-only"):
-        rest.q[0] = 1.0
-
-
 def test_bad_rest():
     dyn = mb.dynamics(mb.catalog.pendulum(), "pinocchio")
     for how, kind, message in (
