@@ -1,7 +1,6 @@
 """Beams as elements of a description: the paper's energies, the oracle, rigid segments, and what is refused."""
 
 import pickle
-from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -391,27 +390,22 @@ def test_file_formats_name_the_beam_alone(form):
         ({"length": 0.0}, "length: expected a number above 0, got 0"),
         ({"length": np.nan}, "length: .*finite"),
         ({"length": 1e-200}, "length: expected a number from 1e-30 to 1e[+]30"),
-        ({"length": 1e200}, "length: expected a number from 1e-30 to 1e[+]30"),
         ({"length": mb.Parameter("L", 1.0)}, "length.*no parameter"),
         ({"stiffness": -1.0}, "stiffness: expected a number from 0, got -1"),
         ({"stiffness": (1.0, 2.0, 3.0)}, r"stiffness: expected shape \(2,\)"),
         ({"stiffness": "steel"}, "stiffness"),
         ({"density": 0.0}, "density: expected a number above 0"),
-        ({"density": None}, "density"),
         ({"damping": -1e-3}, "damping: expected a number from 0"),
         ({"modes": 0}, "modes: expected"),
         ({"modes": 11}, "modes: expected at most 10"),
-        ({"modes": 2.5}, "modes"),
         ({"modes": None}, "expected modes or shapes, one of them"),
         ({"shapes": [POWER]}, "expected modes or shapes, one of them"),
         ({"modes": None, "shapes": []}, "shapes: expected 1 to 10"),
         ({"modes": None, "shapes": [lambda x: x]}, r"shapes\[0\]: expected a numpy.polynomial"),
         ({"modes": None, "shapes": [Polynomial([0, 1.0])]}, r"shapes\[0\]: expected zero with its slope"),
         ({"stiffness": 0, "modes": None, "shapes": [Polynomial([1.0])]}, r"shapes\[0\]: expected zero at the root"),
-        ({"modes": None, "shapes": [Polynomial([0.0])]}, r"shapes\[0\]: expected zero with its slope"),
         ({"modes": None, "shapes": [Polynomial([0, 0, np.inf])]}, r"shapes\[0\]: .*finite"),
         ({"modes": None, "shapes": [Polynomial([0, 0, 1j])]}, r"shapes\[0\]: .*real"),
-        ({"modes": None, "shapes": [Polynomial([0, 0, Fraction(1, 2)])]}, r"shapes\[0\]: .*real"),
         ({"modes": None, "shapes": [POWER, 2 * POWER]}, "shapes: one of them is a sum of the others"),
     ],
 )

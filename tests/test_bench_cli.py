@@ -124,19 +124,13 @@ def test_interrupted_before_anything_was_finished(here, monkeypatch):
 
 BAD = [
     (["bench"], "TARGET"),
-    (["bench", "pandaa"], "did you mean 'panda'"),
     (["bench", "panda", "--methods", "rk5"], "unknown method 'rk5'"),
     (["bench", "pendulum", "--methods", "taylor", "--engines", "pinocchio"], "taylor is not on pinocchio"),
     (["bench", "panda", "--engines", "bullet"], "unknown engine 'bullet'"),
-    (["bench", "panda", "--engines", "oracle"], "leave it out"),
-    (["bench", "panda", "--engines", ","], "at least one"),
     (["bench", "pendulum", "--duration", "-1"], "duration"),
-    (["bench", "pendulum", "--duration", "nan"], "duration"),
-    (["bench", "pendulum", "--seconds", "0"], "seconds"),
     (["bench", "panda", "--repeats", "0"], "--repeats"),
     (["bench", "panda", "--jobs", "0"], "--jobs"),
     (["bench", "panda", "--out", "regular/below"], "regular is not a folder"),
-    (["bench", "pendulum", "--floating-base"], "floating_base"),
 ]
 
 

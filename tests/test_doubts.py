@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit.engines.constrained import off_by
 from mbkit.errors import DoubtfulRunWarning
 from mbkit.methods.registry import Tolerances
 from mbkit.simulate.diagnostics.checks import lost, massless_joints
@@ -370,17 +369,6 @@ def test_a_short_run_in_machine_code_compiles_nothing_for_its_checks():
     assert not {("mass_matrix",), ("potential_energy",)} & set(dyn._machines)
     assert mb.simulate(dyn, [1.0], [0.0], 1.0, dt=0.25).stats.doubts
     assert ("potential_energy",) in dyn._machines
-
-
-def test_texts_of_events_and_of_rounding_are_short():
-    b = mounted("slide", "m", "x", "prismatic", gravity=(0, 0, 0), mass=1.0, axis=(1, 0, 0), friction=1.0)
-    dyn = mb.dynamics(b.build(point_masses=True))
-    run = mb.simulate(dyn, [[0.0], [0.0]], [[0.628], [2.5]], 3.0)
-    assert [repr(x) for x in run.events] == ["0.628 s  x stops (trajectory 0)", "2.500 s  x stops (trajectory 1)"]
-    assert off_by(2.1e-16, "those of rigid loops") == "those of rigid loops to rounding"
-    assert off_by(0.021, "those of rigid loops") == "2.1 % off those of rigid loops"
-    idle = mb.model.JointCoupling("tendon", (), np.zeros(0), 0.0, 0.0, 0.0, 0.0)
-    assert str(idle) == "coupling 'tendon' on no joint: it exerts no force"
 
 
 def test_soft_loops_are_doubted_in_each_run_of_one_engine():

@@ -88,7 +88,7 @@ def test_members_under_a_state_feedback_and_under_a_function() -> None:
 
 def test_no_number_depends_on_the_threads_or_on_the_neighbours() -> None:
     model = rubbed(6, 4, SINGLE)
-    q, v, tau = mostly_at_rest(model, 200)
+    q, v, tau = mostly_at_rest(model, 72)
     runs = []
     for threads, which in ((1, slice(None)), (3, slice(None)), (1, slice(40, 57))):
         dyn = mb.dynamics(model, "lagrangian", threads=threads)
