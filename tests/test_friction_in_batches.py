@@ -10,8 +10,10 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import mbkit as mb
+from mbkit._check import EPS
 from mbkit.errors import InputError, MbkitWarning, ModelError
 from mbkit.model import Model
+from mbkit.simulate.solvers.friction.fixed import first_zero
 from tests.random_trees import off
 from tests.test_dry_friction import mostly_at_rest, rubbed
 
@@ -262,3 +264,20 @@ def test_a_joint_whose_friction_is_zero_in_a_member_has_no_phases_there(
         # Moreau's step has no events.
         assert [e.name for e in events] == ["x stops"] * (method != "moreau")
         assert [e.t for e in events] == pytest.approx([0.412] * len(events), abs=most)
+
+
+def test_the_least_of_two_margins_that_end_together_is_found_in_few_rounds() -> None:
+    slopes, bends = np.array([[1.0, 3.0], [2.0, 0.5]]), np.array([[0.3, -1.0], [0.2, 4.0]])
+    # Both fall through zero at nearly one place, where the least of them has a kink.
+    roots = np.array([[0.4, 0.4 + 1e-9], [0.7, 0.3]])
+    rounds = []
+
+    def margins(x: Any, rows: Any) -> Any:
+        rounds.append(len(x))
+        d = roots[rows] - x[:, None]
+        return (slopes[rows] * d + bends[rows] * d**3) / EPS
+
+    both = np.arange(2)
+    found = first_zero(margins, margins(np.zeros(2), both), margins(np.ones(2), both))
+    assert np.abs(found - roots.min(axis=1)).max() < 4 * EPS
+    assert len(rounds) < 20

@@ -13,6 +13,7 @@ from mbkit.derivation.equations import Equations
 from mbkit.derivation.steps.fixed import Part, function_of
 from mbkit.derivation.steps.symbols import SymbolicSpace, choose
 from mbkit.model.changes.dry_friction import POSE_ROUNDING, ROUNDING, STOPPED
+from mbkit.model.parts import RESTING
 
 
 def holding(equations: Equations, q: Any, v: Any, a: Any, force: Any, parameters: Any) -> Any:
@@ -22,12 +23,13 @@ def holding(equations: Equations, q: Any, v: Any, a: Any, force: Any, parameters
 
 
 def phase_margin(equations: Equations, which: Sequence[int], sides: Sequence[str], locks: Sequence[str]) -> Part:
-    """Return the part behind a step that tells how far its end is from that of its phase, ``margin1``.
+    """Return the part behind a step that tells how far its end is from that of its phase.
 
-    It is the least of the velocities `which`: the speed of one that slides, of one that rests the part of its bound
-    that is left, and 1 of one without a side; negative beyond. `sides` and `locks` are the parameters of their sides
-    and of rotors at rest. The part reads the largest forces at rest, ``bound``. The margin is NaN where the parts of
-    bounds are those of a linear program, as what rests follows from more than one locked velocity.
+    It writes ``margins1`` of the velocities `which`, and the least of them, ``margin1``: the speed of one that slides,
+    of one that rests the part of its bound that is left, and 1 of one without a side; negative beyond. `sides` and
+    `locks` are the parameters of their sides and of rotors at rest. The part reads the largest forces at rest,
+    ``bound``. A margin is NaN where the parts of bounds are those of a linear program, as what rests follows from more
+    than one locked velocity.
     """
     model, space, names = equations.model, SymbolicSpace(equations.model), list(equations.model.parameters)
     place, time = {name: i for i, name in enumerate(names)}, model.time_parameter
@@ -42,11 +44,11 @@ def phase_margin(equations: Equations, which: Sequence[int], sides: Sequence[str
         pick = ca.DM(ca.Sparsity.triplet(len(which), model.nv, list(range(len(which))), list(which)), 1.0)
         ends = space.to_body_velocity(q, w)
         v = (1 - ca.mtimes(pick.T, still)) * ends
-        a = (1 - ca.mtimes(pick.T, still)) * equations.function("forward_dynamics")(q, v, tau, ca.vertcat(*values))
-        loose = [0.0 if name in {*locks} else x for name, x in zip(names, values, strict=True)]
-        needed = holding(equations, q, v, a, tau, ca.vertcat(*loose))
+        a = equations.function("forward_dynamics")(q, v, tau, ca.vertcat(*values))
         speeds = ca.mtimes(pick, v)
         if model.constrained:
+            loose = [0.0 if name in {*locks} else x for name, x in zip(names, values, strict=True)]
+            needed = holding(equations, q, v, (1 - ca.mtimes(pick.T, still)) * a, tau, ca.vertcat(*loose))
             moved = _ways(equations, which)(q, ca.vertcat(*values))
             used = _shared(ca.mtimes(pick, moved), ca.mtimes(moved.T, needed), bound, still, locked)
             # A joint that rows alone hold moves as soon as they do.
@@ -54,12 +56,14 @@ def phase_margin(equations: Equations, which: Sequence[int], sides: Sequence[str
             left = choose(locked, 1.0, 1 - ca.fabs(ca.mtimes(pick, ends)) / (POSE_ROUNDING * size))
             left = ca.fmin(1 + ROUNDING - used, left)
         else:
-            left = 1 + ROUNDING - ca.fabs(ca.mtimes(pick, needed)) / bound
+            # What holds a joint accelerates its rotor.
+            left = 1 + ROUNDING - RESTING * ca.fabs(ca.mtimes(pick, a)) / bound
         margins = choose(still, left, choose(side == 0, 1.0, side * speeds - STOPPED))
         arguments = {"q1": q, "w1": w, "tau": tau, "dt": dt, "bound": bound, "parameters": given}
-        return function_of("phase_margin", arguments, {"margin1": reduce(ca.fmin, ca.vertsplit(margins))})
+        results = {"margin1": reduce(ca.fmin, ca.vertsplit(margins)), "margins1": margins}
+        return function_of("phase_margin", arguments, results)
 
-    return Part("phase_margin", ("q1", "w1", "tau", "dt", "bound", "parameters"), ("margin1",), make)
+    return Part("phase_margin", ("q1", "w1", "tau", "dt", "bound", "parameters"), ("margin1", "margins1"), make)
 
 
 def _ways(equations: Any, which: Sequence[int]) -> ca.Function:

@@ -129,6 +129,7 @@ def run_rollout(
     workers: int | None = None,
     behind: Sequence[Part] = (),
     margins: Array | None = None,
+    record: GridRecord | None = None,
     **read: Array,
 ) -> SolverResult:
     """Step one state or a batch over the grid; no number depends on `workers`, by default one for each core.
@@ -144,7 +145,7 @@ def run_rollout(
     if problem.batch is None and problem.torque.samples is not None and free:
         # Single steps do not look for singular poses.
         return _run_step_by_step(problem)
-    record = GridRecord(problem)
+    record = record or GridRecord(problem)
     space = Space(dyn.model)
     w0, values = space.to_integrator_velocity(problem.q, problem.v), dyn._parameter_values
     clock = None if dyn.model.time_parameter is None else list(dyn.model.parameters).index(dyn.model.time_parameter)

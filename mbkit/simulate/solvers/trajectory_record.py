@@ -91,14 +91,18 @@ class RunRecord:
 
 
 class GridRecord(RunRecord):
-    """Record of a run with a fixed step: kept states of each trajectory, (n, K, ...), and its good steps, (n,)."""
+    """Record of a run with a fixed step: kept states of each trajectory, (n, K, ...), and its good steps, (n,).
 
-    def __init__(self, problem: IntegrationProblem) -> None:
+    The states are put into `room`, q and v, where there is one.
+    """
+
+    def __init__(self, problem: IntegrationProblem, *room: Array) -> None:
         super().__init__(problem)
         self.kept = problem.kept
         n, rows = len(problem.q), len(problem.kept)
         # Written by the threads, so that each of them pays for its own pages.
-        self.q, self.v = np.empty((n, rows, problem.q.shape[1])), np.empty((n, rows, problem.v.shape[1]))
+        room = room or tuple(np.empty((n, rows, x.shape[1])) for x in (problem.q, problem.v))
+        self.q, self.v = (x[:] for x in room)
         self.good: Indices = np.zeros(n, dtype=np.intp)
         if self.kept[0] == 0:
             self.q[:, 0], self.v[:, 0] = problem.q, problem.v

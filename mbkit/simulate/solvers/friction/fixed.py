@@ -7,12 +7,11 @@ ends in parts, to the end of the phase and on from there; the parts are steps of
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
-from scipy.optimize.elementwise import find_root
 
 from mbkit._check import EPS, Array
 from mbkit.engines import Dynamics
@@ -42,6 +41,10 @@ _SET_UP: Final = 2**10
 _MOST_STATES: Final = 2**16
 #: Fraction of a step before which the end of a phase is not searched.
 _FROM: Final = 1e-6
+#: Rounds of the search for a phase's end, at most: two for each bit, and as many again.
+_MAX_ROUNDS: Final = 200
+#: Largest value there that may be rounding, in that of speeds.
+_MAX_NOISE: Final = 2**10
 #: Rest of a step, relative to the time, whose phase ends with it.
 _TIMES: Final = 4 * EPS
 
@@ -171,13 +174,15 @@ class _Members:
         members = self.members[rows] if self.side_by_side else None
         return self.friction.phase(t, self.q[rows], self.v[rows], self.forces(rows), leaving, members)
 
-    def _keep(self, rows: Indices, k: Indices, q: Array, v: Array) -> None:
-        """Put states behind k steps into the record, if they are wanted."""
-        kept = self._record.kept
-        place = np.minimum(np.searchsorted(kept, k), len(kept) - 1)
-        found = kept[place] == k
-        where = self.members[rows][found], place[found]
-        self._record.q[where], self._record.v[where] = q[found], v[found]
+    def _keep(self, rows: Indices, k: Indices, count: Indices, q: Array, v: Array) -> None:
+        """Put wanted states into the record: of (m, n + 1) behind k steps each row has so many, and one in front."""
+        record, dense = self._record, len(self._record.kept) > self.problem.grid.steps
+        # Slices of each row take a quarter of the time of lists of indices of all.
+        each = zip(self.members[rows].tolist(), k.tolist(), count.tolist(), strict=True)
+        for i, (member, first, n) in enumerate(each):
+            saved = slice(first + 1, first + n + 1) if dense else record.rows(first + 1, first + n)
+            which: Any = slice(1, n + 1) if dense else record.kept[saved] - first
+            record.q[member, saved], record.v[member, saved] = q[i, which], v[i, which]
 
     # A block
 
@@ -206,8 +211,14 @@ class _Members:
         start = grid.time(int(k.min()))
         compiled = phase.still.any() and self._compiled(phase.dyn)
         margins = np.empty((len(rows), n)) if compiled and self.side_by_side else None
-        result = self._solved(rows, phase, n, Grid(start, start + n * h, h, n, h), margins)
+        together, *room = self._room(rows, k, n)
+        result = self._solved(rows, phase, n, Grid(start, start + n * h, h, n, h), margins, room)
         q, v = (x if self.side_by_side else x[None] for x in (result.q, result.v))
+        count = q.shape[1]
+        for here, x in zip(room, (q, v), strict=True):
+            if not np.may_share_memory(here, x):
+                here[:, :count] = x
+        q, v = (x[:, :count] for x in room)
         made = np.rint((np.atleast_1d(result.reached) - start) / h).astype(np.intp)
         limit = np.minimum(np.minimum(made, q.shape[1] - 1), np.minimum(left, n))
         if compiled and margins is None:
@@ -216,37 +227,30 @@ class _Members:
             margins = self._margins_of(phase, times, q[0, 1:], v[0, 1:])
         good = self._good(rows, phase, q, v, margins, limit, start, h)
         self._window = self._next_window(good, good < limit)
-        record, first = self._record, int(k[0])
-        if (k == first).all() and (good == n).all():
-            # Most blocks: nothing changes.
-            saved = record.rows(first + 1, first + n)
-            places, every = record.kept[saved] - first, len(rows) == len(record.q)
-            # Views, which are not written twice.
-            here: Any = slice(places[0], places[-1] + 1) if len(places) == n else places
-            still = phase.still[:, None]
-            for whole, x, fixed, holds in (
-                (record.q, q, q[:, :1], self.friction.places(still)),
-                (record.v, v, 0.0, still),
-            ):
-                part = whole[:, saved] if every else x[:, here].copy()
-                part[...] = x[:, here]
-                if holds.any():
-                    np.copyto(part, fixed, where=holds)
-                if not every:
-                    whole[self.members[rows], saved] = part
-        else:
-            steps = np.arange(1, q.shape[1])
-            inside = steps <= good[:, None]
-            row = np.repeat(np.arange(len(rows)), good)
-            states = self.friction.held(phase.still[row], q[row, 0], q[:, 1:][inside], v[:, 1:][inside])
-            self._keep(rows[row], (k[:, None] + steps)[inside], *states)
         last = np.arange(len(rows)), good
-        self.q[rows], self.v[rows] = self.friction.held(phase.still, self.q[rows], q[last], v[last])
+        if phase.still.any():
+            # What rests keeps its place and no velocity, to the bit.
+            np.copyto(q, q[:, :1].copy(), where=self.friction.places(phase.still)[:, None])
+            np.copyto(v, 0.0, where=phase.still[:, None])
+        if not together:
+            self._keep(rows, k, good, q, v)
+        self.q[rows], self.v[rows] = q[last], v[last]
         self.k[rows] = k + good
         self.error = result.error
         if self.error is None:
             self._lose(rows[(good == limit) & (limit < np.minimum(left, n))], result)
             self._across(rows[good < limit])
+
+    def _room(self, rows: Indices, k: Indices, n: int) -> tuple[bool, Array, Array]:
+        """Return room for n steps: that of the record, if all go together and each state is kept, or another."""
+        record, first = self._record, int(k[0])
+        together = len(rows) == len(self.k) and bool((k == first).all())
+        if not together or len(record.kept) <= self.problem.grid.steps:
+            q, v = (np.empty((len(rows), n + 1, x.shape[1])) for x in (self.q, self.v))
+            return False, q, v
+        which = slice(None) if self.side_by_side else slice(int(self.members[0]), int(self.members[0]) + 1)
+        # States behind the end of a phase are written again.
+        return True, record.q[which, first : first + n + 1], record.v[which, first : first + n + 1]
 
     def _next_window(self, good: Indices, changed: Mask) -> int:
         """Return the steps of the next block: more where few phases end, as steps behind an end are in vain."""
@@ -274,8 +278,19 @@ class _Members:
         )
         return np.asarray(dyn._code(part.name, make=part.make)(*given, threads=dyn.threads)[0][:, 0, 0][None])
 
-    def _solved(self, rows: Indices, phase: Phase, n: int, grid: Grid, margins: Array | None = None) -> SolverResult:
-        """Return the run of a block, whose margins are put into an array where one is given, (m, n)."""
+    def _solved(
+        self,
+        rows: Indices,
+        phase: Phase,
+        n: int,
+        grid: Grid,
+        margins: Array | None = None,
+        room: Sequence[Array] = (),
+    ) -> SolverResult:
+        """Return the run of a block, with its margins in an array where one is given, (m, n).
+
+        Machine code puts its states into the `room`, where there is one.
+        """
         problem, k = self.problem, self.k[rows]
         if self.side_by_side:
             torque: Any = problem.torque.of_steps(self.members[rows], k, n)
@@ -285,13 +300,15 @@ class _Members:
             q, v = self.q[0], self.v[0]
         silent, every = Progress(None, ""), np.arange(n + 1, dtype=np.intp)
         own = IntegrationProblem.on_grid(phase.dyn, problem.method, q, v, grid, every, torque, silent)
-        if margins is None:
+        if margins is None and (not room or phase.dyn.model.constrained or not self._compiled(phase.dyn)):
             out = self._solver(phase.dyn)(own)
         else:
             from mbkit.simulate.solvers.compiled_fixed_step import run_rollout
 
-            bound = self.friction.bounds(phase)
-            out = run_rollout(own, behind=[self.margin_part], margins=margins, bound=bound)
+            more: dict[str, Any] = {}
+            if margins is not None:
+                more = {"behind": [self.margin_part], "margins": margins, "bound": self.friction.bounds(phase)}
+            out = run_rollout(own, record=GridRecord(own, *room), **more)
         self._record.count(out)
         self._record.doubts += out.doubts
         return out
@@ -340,7 +357,7 @@ class _Members:
         while len(rows):
             part, every = _PartOfStep(self, rows, phase, start), np.arange(len(rows))
             q, v, margins = part.ahead(every, left)
-            over = (margins < 0) & (left > _TIMES * np.abs(start + left))
+            over = (margins.min(axis=1) < 0) & (left > _TIMES * np.abs(start + left))
             self.q[rows[~over]], self.v[rows[~over]] = q[~over], v[~over]
             for kept, x in zip(self._phase.pattern, phase.pattern, strict=True):
                 kept[rows[~over]] = x[~over]
@@ -361,7 +378,11 @@ class _Members:
         self._phase = self.friction.given(*self._phase.pattern, self._phase.rubbed)
         whole = whole[self._going[whole]]
         self.k[whole] += 1
-        self._keep(whole, self.k[whole], self.q[whole], self.v[whole])
+        record, k = self._record, self.k[whole]
+        places = np.minimum(record.kept.searchsorted(k), len(record.kept) - 1)
+        found = record.kept[places] == k
+        members, which, places = self.members[whole][found], whole[found], places[found]
+        record.q[members, places], record.v[members, places] = self.q[which], self.v[which]
 
     def _following(
         self,
@@ -427,7 +448,7 @@ class _PartOfStep:
         self._stepped = self._method.explicit and timed is None and not callable(self._force)
 
     def ahead(self, i: Indices, s: Array) -> tuple[Array, Array, Array]:
-        """Return the states after s seconds, by one step of the method, and the least of their margins, (m,)."""
+        """Return the states after s seconds, by one step of the method, and their margins, (m, k)."""
         run, phase = self._run, self.phase if len(i) == len(self._rows) else self.phase.take(i)
         force = self._force if callable(self._force) else self._force[i]
         q, v = run.q[self._rows[i]], run.v[self._rows[i]]
@@ -435,7 +456,7 @@ class _PartOfStep:
             given = q, v, force, s[:, None], self._bound[i], self._values[i]
             arrays, finite = self._code.everything(*given, threads=self._threads)
             if finite:
-                return *run.friction.held(phase.still, q, arrays["q1"], arrays["v1"]), arrays["margin1"][:, 0]
+                return *run.friction.held(phase.still, q, arrays["q1"], arrays["v1"]), arrays["margins1"]
         ends = q.copy(), v.copy()
         for j in np.flatnonzero(s > 0):
             own, one = phase.take(np.array([j])), slice(j, j + 1)
@@ -447,7 +468,7 @@ class _PartOfStep:
                 states = out.q, out.v
             for now, x in zip(ends, states, strict=True):
                 now[j] = x.reshape(-1, x.shape[-1])[-1]
-        margins = run.friction.margins(phase, run.times(self._t[i] + s), *ends, force).min(axis=1)
+        margins = run.friction.margins(phase, run.times(self._t[i] + s), *ends, force)
         return *run.friction.held(phase.still, q, *ends), margins
 
     def ends(self, i: Indices, length: Array, over: Array) -> tuple[Array, Mask]:
@@ -457,32 +478,62 @@ class _PartOfStep:
         """
         first = _FROM * length
         noise = EPS * (1 + np.abs(self._run.v[self._rows[i]]).max(axis=1))
-        soon, now = self.ahead(i, first)[2], np.full(len(i), np.inf)
-        early = np.flatnonzero(soon <= -noise)
-        if len(early):
-            now[early] = self.ahead(i[early], 0 * length[early])[2]
+        soon = self.ahead(i, first)[2]
+        now = np.full(soon.shape, np.inf)
         # A joint that rests at its bound to the last bits, and is pulled more and more, lets go in the next instant.
-        at_once = soon <= -noise
+        at_once = soon.min(axis=1) <= -noise
+        if at_once.any():
+            now[at_once] = self.ahead(i[at_once], 0 * length[at_once])[2]
         low, high = np.where(at_once, 0.0, first), np.where(at_once, first, length)
         # A speed that is zero at the end may have faded out long before.
-        faded = over > -noise
-        unit = np.where(faded, STOPPED / 2, noise)
-        at_low, at_high = (np.where(at_once, *x) / unit for x in ((now, np.maximum(soon, 2 * noise)), (soon, over)))
-        out = np.zeros(len(i))
-        open_ = np.flatnonzero(at_low > 0)
+        faded = over.min(axis=1) > -noise
+        unit = np.where(faded, STOPPED / (2 * _MAX_NOISE), noise)[:, None]
+        before = np.where(at_once[:, None], now, np.maximum(soon, 2 * noise[:, None])) / unit
+        after = np.where(at_once[:, None], soon, over) / unit
+        out, open_ = np.zeros(len(i)), np.flatnonzero(before.min(axis=1) > 0)
 
-        def least(x: Array, j: Array) -> Array:
-            j = j.astype(np.intp)
-            known = np.where(x == 0, at_low[j], at_high[j])
-            inside = np.flatnonzero((x > 0) & (x < 1))
-            if len(inside):
-                k = j[inside]
-                known[inside] = self.ahead(i[k], low[k] + x[inside] * (high - low)[k])[2] / unit[k]
-            return np.asarray(known)
+        def margins(x: Array, j: Indices) -> Array:
+            k = open_[j]
+            return self.ahead(i[k], low[k] + x * (high - low)[k])[2] / unit[k]
 
         if len(open_):
-            ends = np.zeros(len(open_)), np.ones(len(open_))
-            tolerances = {"xatol": 4 * EPS, "xrtol": 4 * EPS, "fatol": 1.0}
-            found = find_root(least, ends, args=(open_,), tolerances=tolerances).x
-            out[open_] = np.where(np.isfinite(found), low[open_] + found * (high - low)[open_], 0.0)
+            found = first_zero(margins, before[open_], after[open_])
+            out[open_] = low[open_] + found * (high - low)[open_]
         return out, faded
+
+
+def first_zero(function: Callable[[Array, Indices], Array], before: Array, after: Array) -> Array:
+    """Return where the first of some smooth functions falls to zero between 0 and 1, to ±1 or its noise, (m,).
+
+    function(x, rows) has the values at x, (n, k). They are all positive `before`, at 0, and one is not `after`, at 1,
+    (m, k) each. The least of them has a kink where another one becomes it. So the function whose chord falls first is
+    interpolated, by the inverse parabola through three places or the chord, with bisection where that is slow.
+    """
+    m, going = len(before), np.arange(len(before))
+    # Places above and below zero, and the last one that was replaced.
+    x, f = np.array([[0.0], [1.0], [np.nan]]) + np.zeros(m), np.array([before, after, np.full(before.shape, np.nan)])
+    out, slow, best = np.ones(m), np.zeros(m, dtype=int), np.full(m, np.inf)
+    for _ in range(_MAX_ROUNDS):
+        if not len(going):
+            break
+        (low, high, old), (above, below, other), rows = x[:, going], f[:, going], np.arange(len(going))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            chords = np.where(below < 0, above / (above - below), np.inf)
+            j = chords.argmin(axis=1)
+            a, b, c = above[rows, j], below[rows, j], other[rows, j]
+            parts = low * b * c / (a - b) / (a - c), high * a * c / (b - a) / (b - c), old * a * b / (c - a) / (c - b)
+            curve, chord = sum(parts), low + chords[rows, j] * (high - low)
+        guess = np.where((low < curve) & (curve < high), curve, chord)
+        guess = np.where((slow[going] > 1) | ~((low < guess) & (guess < high)), 0.5 * (low + high), guess)
+        values = function(guess, going)
+        least, before = values.min(axis=1), best[going]
+        end, width, size = (least < 0).astype(int), high - low, np.abs(least)
+        x[2, going], f[2, going] = x[end, going], f[end, going]
+        x[end, going], f[end, going] = guess, values
+        out[going], best[going] = np.where(size < before, guess, out[going]), np.minimum(size, before)
+        left = x[1, going] - x[0, going]
+        slow[going] = np.where(left > 0.5 * width, slow[going] + 1, 0)
+        # Small values that do not fall are rounding.
+        noise = (size < _MAX_NOISE) & (size > 0.5 * before)
+        going = going[(size > 1) & ~noise & (left > 4 * EPS * (1 + guess))]
+    return out

@@ -15,6 +15,7 @@ from mbkit.engines.base import at_time
 from mbkit.engines.elements.dry_friction import Mask
 from mbkit.model.changes.dry_friction import ROUNDING, STOPPED
 from mbkit.model.elements.paths import ALL, Path
+from mbkit.model.parts import RESTING
 from mbkit.simulate.constraint_projection import settled
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.solvers.friction.beside_rows import fades, independent, shares, slow, stopped
@@ -182,15 +183,16 @@ class Friction:
     def holding(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> Array:
         """Return the forces of friction on what rests, and zero elsewhere; of the shape of v."""
         tau = applied(force, t, q, v)
-        # Without the friction of what rests, and without its rotor.
-        free = self._dynamics(phase.rubbed, np.where(phase.still, 0.0, phase.sides), phase.still & False)
-        dyn, loose = (at_time(x, t) for x in (phase.dyn, free._bare or free))
-        a = np.where(phase.still, 0.0, dyn.forward_dynamics(q, v, tau))
-        pulled = loose.inverse_dynamics(q, v, a) - tau[..., : v.shape[-1]]
-        if dyn._acting[0]:
-            pulled = pulled - _of_wrenches(phase.rubbed, q, tau)
+        a = at_time(phase.dyn, t).forward_dynamics(q, v, tau)
         if not self._bound:
-            return np.where(phase.still, pulled, 0.0)
+            # What holds a joint accelerates its rotor.
+            return np.where(phase.still, -RESTING * a, 0.0)
+        # Beside rows, so small an acceleration may be their rounding: without the friction of what rests and its rotor.
+        free = self._dynamics(phase.rubbed, np.where(phase.still, 0.0, phase.sides), phase.still & False)
+        loose = at_time(free._bare or free, t)
+        pulled = loose.inverse_dynamics(q, v, np.where(phase.still, 0.0, a)) - tau[..., : v.shape[-1]]
+        if phase.dyn._acting[0]:
+            pulled = pulled - _of_wrenches(phase.rubbed, q, tau)
         bound, out = np.ones(v.shape), np.zeros(v.shape)
         bound[..., self.which] = self.bounds(phase)
         N, needed, most = self._directions(phase.rubbed, t, q), _rows(pulled), _rows(bound)
