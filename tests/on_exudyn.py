@@ -4,7 +4,6 @@ import exudyn as exu
 import exudyn.utilities as eu
 import numpy as np
 
-VERSION = exu.config.Version()
 KINDS = {"revolute": exu.JointType.RevoluteZ, "prismatic": exu.JointType.PrismaticZ}
 
 
@@ -20,7 +19,7 @@ def built(data):
         p, R = p + R @ np.array(joint["translation"]), R @ np.array(joint["rotation"])
         names[joint["name"]] = []
         for step in joint["steps"]:
-            if step["type"] not in KINDS or any(joint["armature"]):
+            if step["type"] not in KINDS or any(joint["rotors"]):
                 raise NotImplementedError(f"joint {joint['name']!r} is {step['type']}, or has a rotor")
             z = np.array(step["axes"][0])
             x = np.linalg.svd(z[None])[2][1]

@@ -13,7 +13,7 @@ from mbkit.errors import InputError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.parts import Loop, Prescribed
 from mbkit.studies.explain import terms
-from mbkit.studies.explain.loops import exchanged
+from mbkit.studies.explain.hypotheses import exchanged
 from mbkit.studies.motions import reference as references
 from mbkit.studies.motions.reference import reference
 from mbkit.studies.study_runs import start_state

@@ -13,7 +13,7 @@ import pytest
 import mbkit as mb
 from mbkit.errors import ModelError
 from mbkit.model import Loop
-from mbkit.studies.explain.loops import moved
+from mbkit.studies.explain.hypotheses import moved
 from mbkit.studies.explain.merged_model import Tolerances
 from mbkit.studies.importers import study
 from mbkit.studies.importers.loops import Written, between_joints, coupler_differences, loop_differences

@@ -76,7 +76,6 @@ def test_put_model_holds_what_the_file_says(tmp_path: Path) -> None:
 #: An engine whose `put_model` is a copy of MuJoCo's model, in the present interpreter.
 HELD = """
 import copy, mujoco, numpy as np, on_mujoco
-VERSION = "1"
 
 def put(m):
     m = copy.copy(m)
@@ -95,7 +94,6 @@ class Engine(on_mujoco.Engine):
 """
 HANGS = """
 import time
-VERSION = "1"
 class Engine: ...
 def imported(*_, **__): time.sleep(60)
 """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import mbkit as mb
 from mbkit._child_process import end_all
 from mbkit.engines.pinocchio.engine import PinocchioDynamics
 from mbkit.engines.registry import EngineInfo, register_engine
-from mbkit.engines.remote.description import STACKED, Convention
+from mbkit.engines.remote.description import STACKED, Convention, travelling
 from mbkit.engines.remote.packages import (
     PACKAGES,
     Package,
@@ -130,7 +131,6 @@ def test_a_curve_that_rounding_bends_back_names_its_best_step():
 # Stacks of states in one call, and an engine in a file of one's own.
 
 ENGINE = """
-VERSION = "1.0"
 calls = []
 
 
@@ -449,6 +449,16 @@ def test_a_method_that_an_engine_lacks_is_refused_by_name(real):
         dyn.rollout([0.1, 0.2], [0.0, 0.0], 1e-3, 2, "discrete")
     with pytest.raises(UnsupportedError, match="mujoco_discrete: not on"):
         mb.simulate(dyn, [0.1, 0.2], [0.0, 0.0], 0.01, "mujoco_discrete", dt=1e-3)
+
+
+def test_the_file_of_the_book_asks_for_what_is_sent():
+    """Its engine is in few environments; the names that it reads are checked in all."""
+    sent, _ = travelling(STACKED, floating())
+    text, places = EXUDYN.read_text(), {"data": sent, "joint": sent["joints"][0], "body": sent["bodies"]["trunk"]}
+    for name, there in places.items():
+        asked = set(re.findall(rf'{name}\["(\w+)"\]', text))
+        assert asked
+        assert asked <= {*there}, name
 
 
 @pytest.mark.usefixtures("users_own")

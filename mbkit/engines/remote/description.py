@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mbkit.engines.base import BESIDE, OF_ANY_ENGINE, OF_COUPLINGS, OF_TREES, ROTORS_OF_SEVERAL, SOLVED, STACKS
-from mbkit.model import Joint, Model
+from mbkit.model import Body, Joint, Model
 from mbkit.model.elements.kinds import joint_types
 from mbkit.model.elements.paths import Path
 from mbkit.model.validation import static_bodies
@@ -80,26 +80,23 @@ def travelling(steps: Steps | None, model: Model) -> tuple[dict[str, Any], dict[
     if steps is None:
         return _mjcf(model)
     static = static_bodies(model.joints)
+    numbers = ("rotation", "translation", "damping", "stiffness", "rest", "rotors")
     return {
         "gravity": model.gravity.tolist(),
-        "bodies": {
-            b.name: {"mass": b.mass, "com": b.com.tolist(), "inertia": b.inertia.tolist(), "static": b.name in static}
-            for b in model.bodies
-        },
+        "bodies": {b.name: {**_plain(b, "mass", "com", "inertia"), "static": b.name in static} for b in model.bodies},
         "joints": [
             {
-                "name": joint.name,
-                "parent": joint.parent,
-                "child": joint.child,
-                "rotation": joint.rotation.tolist(),
-                "translation": joint.translation.tolist(),
-                **{name: getattr(joint, name).tolist() for name in ("damping", "stiffness", "rest")},
-                "rotors": joint.rotors.tolist(),
+                **_plain(joint, "name", "parent", "child", *numbers),
                 "steps": [{**step, "type": _plain_type(step["type"])} for step in steps[joint.kind](joint)],
             }
             for joint in model.tree
         ],
     }, {joint.name: (joint.name,) for joint in model.joints}
+
+
+def _plain(part: Joint | Body, *fields: str) -> dict[str, Any]:
+    values = ((name, getattr(part, name)) for name in fields)
+    return {name: x.tolist() if isinstance(x, np.ndarray) else x for name, x in values}
 
 
 def _plain_type(kind: str) -> str:
@@ -132,19 +129,11 @@ def places(
     convention: Convention, model: Model, names: Mapping[str, Sequence[str]], joints: Mapping[str, Any]
 ) -> Places:
     """Return the places of an engine's coordinates, from those of its joints, by name."""
-    layout = model.layout
-    own: dict[str, tuple[list[int], list[int]]] = {}
-    for joint in model.joints:
-        if joint.type.nv:
-            at = [joints[name] for name in names[joint.name]]
-            own[joint.name] = [k for q, _ in at for k in q], [k for _, v in at for k in v]
-    q_index = np.zeros(sum(len(q) for q, _ in own.values()), int)
-    v_index = np.zeros(sum(len(v) for _, v in own.values()), int)
-    turning = []
-    for joint in model.joints:
-        if joint.name not in own:
-            continue
-        at_q, at_v = own[joint.name]
+    layout, turning = model.layout, []
+    of_q, of_v = dict[int, int](), dict[int, int]()
+    for joint in (j for j in model.joints if j.type.nv):
+        own = [joints[name] for name in names[joint.name]]
+        at_q, at_v = ([k for one in own for k in one[i]] for i in (0, 1))
         order_q: Sequence[int] = range(joint.type.nq)
         order_v: Sequence[int] = range(joint.type.nv)
         if joint.type.quaternion is not None:
@@ -153,6 +142,7 @@ def places(
             order_v = convention.free_v if free else order_v
             if joint.kind in convention.turned:
                 turning.append((joint, at_q, at_v))
-        q_index[at_q] = layout.full_q[joint.name].start + np.array(order_q, int)
-        v_index[at_v] = layout.full_v[joint.name].start + np.array(order_v, int)
+        of_q |= zip(at_q, (layout.full_q[joint.name].start + k for k in order_q), strict=True)
+        of_v |= zip(at_v, (layout.full_v[joint.name].start + k for k in order_v), strict=True)
+    q_index, v_index = (np.array([of[k] for k in range(len(of))], int) for of in (of_q, of_v))
     return Places(q_index, v_index, tuple(turning))

@@ -66,10 +66,8 @@ class VersionDynamics(MappedDynamics):
         self._process, self._key, self._held = process_of(version), new_key(), 0
         weakref.finalize(self, self._process.unneeded.append, self._key)
         self._build()
-        gives = self._call("about")[0]["gives"]
-        layout = self.model.layout
+        layout, gives = self.model.layout, self._gives
         orders = (np.arange(n) for n in layout.sizes[2:])
-        self._gives = frozenset(gives)
         self._springs = JointPassive(self.model, *orders)
         #: Passive forces that the engine does not know of.
         self._beside = None if "passive" in gives else self._springs
@@ -125,12 +123,12 @@ class VersionDynamics(MappedDynamics):
             head, _ = self._call("build", **self._data)
         except RemoteError as error:
             raise UnsupportedError(f"{self.engine}: refuses {self.model.name}: {error}") from None
-        self._take_places(head["joints"])
+        self._take_head(head)
 
-    def _take_places(self, joints: Mapping[str, Any]) -> None:
-        """Take the places of the engine's coordinates."""
-        self._places = places(self._convention, self.model, self._names, joints)
-        self._v_index = self._places.v_index
+    def _take_head(self, head: Mapping[str, Any]) -> None:
+        """Take the places of the engine's coordinates, and the names of its quantities."""
+        self._places = places(self._convention, self.model, self._names, head["places"])
+        self._v_index, self._gives = self._places.v_index, frozenset(head["gives"])
 
     def _ask(self, name: str, *arrays: Array, **plain: Any) -> list[Array]:
         if name not in self._gives:

@@ -17,10 +17,8 @@ from mbkit.engines.remote.dynamics import VersionDynamics
 from mbkit.engines.remote.packages import PACKAGES, EngineVersion
 from mbkit.engines.remote.process import RemoteError, new_key, process_of
 from mbkit.errors import UnsupportedError
-from mbkit.model import Coupler, Joint, Model
+from mbkit.model import Coupler, Model
 
-#: Fields of joints that have another name on the way.
-_FIELDS: Final = {"rotors": Joint.adding_to("T")[0]}
 #: The file in `remote` of engines that take MuJoCo's model.
 _MUJOCO: Final = "mujoco_importer"
 
@@ -84,7 +82,7 @@ class _Read(VersionDynamics):
             # The process that held the reading has died since.
             self._import()
             self._generation = self._held
-        self._take_places(self.said["places"])
+        self._take_head(self.said)
 
     def terms(self, q: Array, v: Array, without: tuple[str, ...] = ()) -> dict[str, Array]:
         """Return M, g, nle and passive at a batch of states, without some of what acts beside bodies and joints."""
@@ -141,16 +139,8 @@ def _model(name: str, said: Mapping[str, Any]) -> Model:
     for body, mass, com, inertia in said["bodies"]:
         parts.body(body, mass, np.array(com), np.array(inertia))
     for (joint, kind, parent, child, R, p), numbers in said["joints"]:
-        # None stands for no limit.
-        values = {
-            _FIELDS.get(k, k): np.array([_SIGN.get(k, 1.0) * np.inf if y is None else y for y in x])
-            for k, x in numbers.items()
-        }
+        values = {name: np.array(x) for name, x in numbers.items()}
         if kind == "revolute" and np.isinf(values["lower"]).all() and np.isinf(values["upper"]).all():
             kind = "continuous"
         parts.joint(joint, kind, parent, child, np.array(R), np.array(p), **values)
     return parts.model(name, np.array(said["gravity"]))
-
-
-#: The infinity that stands for no limit.
-_SIGN: Final = {"lower": -1.0, "upper": 1.0, "velocity_limit": 1.0, "effort_limit": 1.0}

@@ -25,7 +25,7 @@ from mbkit.model.elements.formula import Formula
 from mbkit.model.elements.references import KINDS_OF_PARTS, called
 from mbkit.model.parts import ENTRIES, OF_Q, PointSpring, rules_of
 from mbkit.studies._targets import resolved, resolved_options
-from mbkit.studies.explain.mistakes import turn_of
+from mbkit.studies.explain.hypotheses import turn_of
 
 Part = dict[str, Any]
 #: Section -> part -> field -> number, text or list of numbers; a flat section has one part without name.

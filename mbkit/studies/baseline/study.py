@@ -44,7 +44,7 @@ from mbkit.studies.baseline.file import FRAMES, ROLLOUT, Baseline, Rollout, path
 from mbkit.studies.baseline.result import BaselineResult, ChangedNumber, Status, VersionChange
 from mbkit.studies.compare.errors import Errors, Scales
 from mbkit.studies.compare.terms import TERMS, States, states
-from mbkit.studies.explain.mistakes import turn_of
+from mbkit.studies.explain.hypotheses import turn_of
 from mbkit.studies.results import Refusal
 from mbkit.studies.study_runs import quiet_simulate, require_motion
 

@@ -8,10 +8,10 @@ a body enter the terms linearly; these are fitted, and what has another origin l
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
-from itertools import chain, combinations
+from itertools import chain, combinations, product
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -25,15 +25,13 @@ from mbkit.model import JointCoupling, Model
 from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.kinds import PART_KINDS, that_do
 from mbkit.studies.explain import terms
+from mbkit.studies.explain.hypotheses import absences, body_mistakes, joint_mistakes
 from mbkit.studies.explain.merged_model import MergedModel, merge, number_text
-from mbkit.studies.explain.mistakes import Mistake, body_mistakes, joint_mistakes
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.terms import TERM, TINY, Gaps, Values, evaluated, gaps, larger, model_terms, worst
 
 #: The field that adds to T along a rate.
 _ROTOR: Final = JointCoupling.adding_to("T")[0]
-#: Numbers of a joint that an engine may leave out, and what they are called.
-_JOINT_NUMBERS: Final = {n: n for n in ("armature", "damping", "friction")} | {"stiffness": "spring"}
 #: Quantities beside the terms of every explanation, in which known defects show.
 _FURTHER_TERMS: Final = ("C v", "kinetic energy")
 #: Terms mixed up: kind, sentence, and each term's parts with their factors.
@@ -94,6 +92,10 @@ class _Trial(NamedTuple):
     values: Values
 
 
+#: A convention's kind and sentence, and how `_Engines._answers` asks in it.
+_Convention = tuple[str, str, dict[str, Any]]
+
+
 class _Engines:
     """Two engines on one description."""
 
@@ -115,6 +117,7 @@ class _Engines:
         # Pinocchio is fast: it answers for the first engine where both say the same.
         described = gaps(self.values[a], model_terms(self.model, self.at), self.at, self.model)
         self.pinocchio_agrees = worst(described) <= self.tolerance
+        self.own = self._terms(self.model)
 
     def _terms(self, model: Model, **states: Any) -> Values:
         """Return the first engine's terms of another description or at other states; none where it refuses."""
@@ -175,32 +178,25 @@ class _Engines:
     # Conventions of questions and answers, the likely ones first.
 
     def _conventions(self) -> Iterator[_Trial]:
-        model, own = self.model, self._terms(self.model)
-        yield from self._velocity_frames()
-        for shift, one, other in ((1, "first", "last"), (-1, "last", "first")) if model.quaternions else ():
-            order = np.arange(model.nq)
-            for start, _ in model.quaternions:
-                order[start : start + 4] = start + np.roll(np.arange(4), shift)
-            says = f"reads quaternions w {one}, which are written w {other}"
-            yield _Trial("quaternion order", "", says, self._answers(order))
         for kind, says, mix in _MIXED_TERMS:
-            known = {term: parts for term, parts in mix.items() if {term, *parts} <= own.keys()}
-            mixed = {t: np.asarray(sum(x * own[name] for name, x in parts.items())) for t, parts in known.items()}
-            yield _Trial(kind, "", says, own | mixed)
-        yield from self._joint_orders()
+            known = {term: parts for term, parts in mix.items() if {term, *parts} <= self.own.keys()}
+            mixed = {t: np.asarray(sum(x * self.own[n] for n, x in parts.items())) for t, parts in known.items()}
+            yield _Trial(kind, "", says, self.own | mixed)
+        for kind, says, asked in chain(self._velocity_frames(), self._orders()):
+            yield _Trial(kind, "", says, self._answers(**asked))
 
     def _answers(
         self,
         order: np.ndarray | None = None,
-        velocities: Array | None = None,
+        T: Array | None = None,
         slip: Callable[[Array], Array] | None = None,
     ) -> Values:
         """Return the terms in other coordinates, of which entry i is entry ``order[i]`` of the first engine's.
 
-        `velocities` is T, (N, nv, nv), with T v the velocity for the first engine; `slip` returns from velocities the
-        accelerations that nle must hold in addition.
+        T v is the velocity for the first engine, (N, nv, nv); `slip` returns from velocities the accelerations that nle
+        must hold in addition.
         """
-        q, v, T = self.at.q.copy(), self.at.v, velocities
+        q, v = self.at.q.copy(), self.at.v
         if order is not None:
             q[:, order] = self.at.q
         if T is not None:
@@ -218,9 +214,9 @@ class _Engines:
     def _permutation(self, order: np.ndarray) -> Array:
         return np.tile(np.eye(len(order))[:, order], (len(self.at.q), 1, 1))
 
-    def _velocity_frames(self) -> Iterator[_Trial]:
+    def _velocity_frames(self) -> Iterator[_Convention]:
         """Yield velocities of free joints in other axes or in the other order."""
-        layout, kind = self.model.layout, "velocity frame"
+        layout, kind, order = self.model.layout, "velocity frame", np.arange(self.model.nv)
         free = [(layout.q[j.name], layout.v[j.name]) for j in self.model.independent_joints if j.type.floating]
         if not free:
             return
@@ -233,30 +229,30 @@ class _Engines:
                 out[:, rows.start : rows.start + 3] = -np.cross(angular, linear)
             return out
 
-        def turned(parts: Sequence[int]) -> Array:
-            T = self._permutation(np.arange(self.model.nv))
-            for q, v in free:
-                R = spatial.matrix_from_quaternion(self.at.q[:, q.stop - 4 : q.stop])
-                for rows in (slice(v.start + k, v.start + k + 3) for k in parts):
-                    T[:, rows, rows] = np.swapaxes(R, 1, 2)
-            return T
-
-        says = "turns accelerations of free joints out of the world's axes without ω × v"
-        yield _Trial(kind, "", says, self._answers(slip=slip))
+        yield kind, "turns accelerations of free joints out of the world's axes without ω × v", {"slip": slip}
         for parts, which in (((0,), "linear velocity"), ((3,), "angular velocity"), ((0, 3), "velocity")):
-            says, T = f"has the {which} of free joints in the world's axes", turned(parts)
+            T = self._permutation(order)
+            for (q, v), k in product(free, parts):
+                rows = slice(v.start + k, v.start + k + 3)
+                R = spatial.matrix_from_quaternion(self.at.q[:, q.stop - 4 : q.stop])
+                T[:, rows, rows] = np.swapaxes(R, 1, 2)
+            says = f"has the {which} of free joints in the world's axes"
             # v = T w, so that v̇ = T ẇ + Ṫ w: the linear part turns away under the body.
-            yield _Trial(kind, "", says, self._answers(velocities=T, slip=slip if 0 in parts else None))
-            yield _Trial(kind, "", f"{says}, turned without the term of the turning axes", self._answers(velocities=T))
-        order = np.arange(self.model.nv)
+            yield kind, says, {"T": T, "slip": slip if 0 in parts else None}
+            yield kind, f"{says}, turned without the term of the turning axes", {"T": T}
         for _, v in free:
             order[v] = np.roll(order[v], 3)
         says = "has the angular velocity of free joints before the linear one"
-        yield _Trial(kind, "", says, self._answers(velocities=self._permutation(order)))
+        yield kind, says, {"T": self._permutation(order)}
 
-    def _joint_orders(self) -> Iterator[_Trial]:
-        model, layout = self.model, self.model.layout
-        names = list(model.joint_names)
+    def _orders(self) -> Iterator[_Convention]:
+        """Yield orders of a quaternion's numbers, and of joints."""
+        model, layout, names = self.model, self.model.layout, [*self.model.joint_names]
+        for shift, one, other in ((1, "first", "last"), (-1, "last", "first")) if model.quaternions else ():
+            order = np.arange(model.nq)
+            for start, _ in model.quaternions:
+                order[start : start + 4] = start + np.roll(np.arange(4), shift)
+            yield "quaternion order", f"reads quaternions w {one}, which are written w {other}", {"order": order}
         orders = [
             *(("has the joints in the order of their names", sorted(names, key=key)) for key in (str, str.lower)),
             ("has the joints depth first", [j.name for j in model.tree if j.name in names]),
@@ -266,15 +262,15 @@ class _Engines:
         for a, b in combinations(names, 2):
             swapped = [{a: b, b: a}.get(name, name) for name in names]
             orders.append((f"has joints {a!r} and {b!r} in each other's place", swapped))
-        for says, order in orders:
-            q, v = (np.concatenate([np.r_[rows[n]] for n in order]) for rows in (layout.q, layout.v))
-            yield _Trial("joint order", "", says, self._answers(q, self._permutation(v)))
+        for says, some in orders:
+            q, v = (np.concatenate([np.r_[rows[n]] for n in some]) for rows in (layout.q, layout.v))
+            yield "joint order", says, {"order": q, "T": self._permutation(v)}
 
     # Quantities that enter the terms linearly.
 
     def _linear(self) -> Iterator[_Trial]:
         """Yield quantities left out of the whole robot, and fits of gravity, rotors and damping."""
-        own, wanted = self._terms(self.model), self.target
+        own, wanted = self.own, self.target
         kinds = [
             k for name, k in PART_KINDS.items() if name in self.model.acts and k.does <= {"T", "V", "loss", "force"}
         ]
@@ -333,8 +329,7 @@ class _Engines:
                 says = f"has other matter in it: {number_text(more)} kg more than {mass}"
                 yield _Trial("inertia", subject, says, values)
         for joint in whole.model.joints:
-            none = [Mistake(kind, f"has no {kind}", {n: 0.0 * getattr(joint, n)}) for n, kind in _JOINT_NUMBERS.items()]
-            for x in (*none, *joint_mistakes(joint)):
+            for x in (*absences(joint), *joint_mistakes(joint)):
                 # A mimic joint that is free has other coordinates, and could not have been compared.
                 if x.fields.get("mimic", joint) is not None:
                     values = self._terms(whole.put(("joints", joint.name), x.fields).model)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain, product
 from typing import Any, Final
 
 import numpy as np
@@ -51,15 +52,12 @@ class Matching:
 
 def match(a: Model, b: Model, near: Tolerances) -> Matching:
     """Match the joints of two merged descriptions."""
-    names = {j.name for j in b.joints}
-    to_b = {j.name: j.name for j in a.joints if j.name in names}
     assignment = _Assignment(a, b, near)
-    by_structure = assignment.solve()
-    for name in to_b:
-        if name not in by_structure and name not in by_structure.values():
-            by_structure[name] = name
-    if assignment.cost(by_structure) < assignment.cost(to_b):
-        to_b = by_structure
+    by_name = {name: name for name in assignment.a.joints if name in assignment.b.joints}
+    to_b = assignment.solve()
+    to_b |= {name: name for name in by_name if name not in to_b and name not in to_b.values()}
+    if not assignment.cost(to_b) < assignment.cost(by_name):
+        to_b = by_name
     pairs = [(j.name, to_b[j.name]) for j in a.joints if j.name in to_b]
     return Matching(
         tuple(Match(x, y, "name" if x == y else "structure") for x, y in pairs),
@@ -78,8 +76,13 @@ class _Tree:
         self.carrier = {j.child: j.name for j in model.joints}
         self.children = by_key((j.parent, j) for j in model.joints)
         #: Number of joints on a body and beyond, and the joint that carries it.
-        self.sizes = {j.child: sum(j.name in chain for chain in model.chains.values()) for j in model.joints}
+        self.sizes = {j.child: sum(j.name in above for above in model.chains.values()) for j in model.joints}
         self.levels = [["world"], *by_key((len(model.chains[j.name]), j.child) for j in model.tree).values()]
+
+    def on(self, body: str) -> tuple[list[Joint], Array]:
+        """Return the joints on a body, and what it costs to leave each alone with all that it carries."""
+        some = self.children.get(body, [])
+        return some, np.array([_ALONE_COST * self.sizes[j.child] for j in some])
 
 
 class _Assignment:
@@ -89,12 +92,19 @@ class _Assignment:
         self.near, self.a, self.b = near, _Tree(a), _Tree(b)
 
     def solve(self) -> dict[str, str]:
+        from scipy.optimize import linear_sum_assignment
+
         #: Two bodies -> the cost of all that they carry, and the pairs of joints on them.
         below: dict[tuple[str, str], tuple[float, list[tuple[Joint, Joint]]]] = {}
-        for ours, theirs in reversed(list(zip(self.a.levels, self.b.levels, strict=False))):
-            for x in ours:
-                for y in theirs:
-                    below[x, y] = self._siblings(self.a.children.get(x, []), self.b.children.get(y, []), below)
+        for x, y in chain(*(product(*two) for two in [*zip(self.a.levels, self.b.levels, strict=False)][::-1])):
+            (ours, alone), (theirs, others) = self.a.on(x), self.b.on(y)
+            costs = [[self._own(i, k) + below[i.child, k.child][0] for k in theirs] for i in ours]
+            # A pair that costs more than both alone is none.
+            more = np.reshape(costs, (len(ours), len(theirs))) - alone[:, None] - others
+            rows, columns = linear_sum_assignment(np.minimum(more, 0.0))
+            pairs = [(i, k) for i, k in zip(rows, columns, strict=True) if more[i, k] < 0]
+            cost = alone.sum() + others.sum() + sum(more[pair] for pair in pairs)
+            below[x, y] = float(cost), [(ours[i], theirs[k]) for i, k in pairs]
         out: dict[str, str] = {}
         waiting = below["world", "world"][1]
         while waiting:
@@ -102,28 +112,6 @@ class _Assignment:
             out[joint.name] = other.name
             waiting += below[joint.child, other.child][1]
         return out
-
-    def _siblings(
-        self,
-        ours: list[Joint],
-        theirs: list[Joint],
-        below: Mapping[tuple[str, str], tuple[float, list[tuple[Joint, Joint]]]],
-    ) -> tuple[float, list[tuple[Joint, Joint]]]:
-        from scipy.optimize import linear_sum_assignment
-
-        n, k = len(ours), len(theirs)
-        alone = [self.a.sizes[j.child] for j in ours], [self.b.sizes[j.child] for j in theirs]
-        if not n or not k:
-            return _ALONE_COST * (sum(alone[0]) + sum(alone[1])), []
-        # Beside the pairs, each joint may stay alone.
-        cost = np.full((n + k, n + k), np.inf)
-        cost[n:, k:] = 0.0
-        cost[range(n), range(k, n + k)] = _ALONE_COST * np.array(alone[0])
-        cost[range(n, n + k), range(k)] = _ALONE_COST * np.array(alone[1])
-        cost[:n, :k] = [[self._own(x, y) + below[x.child, y.child][0] for y in theirs] for x in ours]
-        rows, columns = linear_sum_assignment(cost)
-        pairs = [(ours[i], theirs[j]) for i, j in zip(rows, columns, strict=True) if i < n and j < k]
-        return float(cost[rows, columns].sum()), pairs
 
     def cost(self, to_b: Mapping[str, str]) -> float:
         """Return the cost of any assignment."""
@@ -137,16 +125,12 @@ class _Assignment:
     def _own(self, a: Joint, b: Joint) -> float:
         x, y, near = self.a.bodies[a.child], self.b.bodies[b.child], self.near
         far = np.array([[np.linalg.norm(a.translation)], [np.linalg.norm(b.translation)]])
-        other_kind = _FRAME_COST if a.type.motion == b.type.motion else _KIND_COST
-        frames = len(near.differing(a, b, "axes", "rotation", "translation")) + (not near.point(x.com, y.com))
+        kind = _FRAME_COST if a.type.motion == b.type.motion else _KIND_COST
+        frames = len(near.differing(a, b, "axes", *_FRAMES)) + (not near.point(x.com, y.com))
         numbers = (not near.point(*far)) + (not near.number(x.mass, y.mass))
         numbers += not near.inertia(self.a.moments[x.name], self.b.moments[y.name], x.mass)
-        return (
-            _NAME_COST * (a.name != b.name)
-            + other_kind * (a.kind != b.kind)
-            + _FRAME_COST * frames
-            + _NUMBER_COST * numbers
-        )
+        other = _NAME_COST * (a.name != b.name) + kind * (a.kind != b.kind)
+        return other + _FRAME_COST * frames + _NUMBER_COST * numbers
 
 
 # The second description with names, order and frames of the first.
@@ -257,7 +241,7 @@ def reconcile_joint_sets(
         side = 0 if matching.only_a else 1
         model, names = sides[side], matching.only_a or matching.only_b
         name = next(j.name for j in model.tree if j.name in names)
-        below = {n for n, chain in model.chains.items() if name in chain}
+        below = {n for n, above in model.chains.items() if name in above}
         options = {True: _held(model, name)}
         if len(below) < len(model.joints):
             options[False] = restricted(model, {j.name for j in model.joints} - below)

@@ -25,6 +25,10 @@ from mbkit.studies._targets import with_values
 OTHERS: Final = tuple(kind for kind in KINDS_OF_PARTS if kind not in ("bodies", "joints"))
 
 
+#: A part's section and name, or "links", the body and the link, or "" for the description itself.
+Where = tuple[str, ...]
+
+
 @dataclass(frozen=True)
 class Tolerances:
     """Comparison of parts of descriptions to a relative tolerance, field by field."""
@@ -151,10 +155,9 @@ class MergedModel:
         x = self.model.body(body)
         return MassProperties(x.mass, x.com, x.inertia)
 
-    def put(self, where: tuple[str, ...], values: Mapping[str, Any]) -> MergedModel:
+    def put(self, where: Where, values: Mapping[str, Any]) -> MergedModel:
         """Return the description with other fields in one part.
 
-        `where` is the part's section and name, or "links", the body and the link, or "" for the description itself.
         With a section alone `values` are whole parts by name, None for one that is taken away.
         """
         section, *names = where

@@ -15,7 +15,7 @@ import numpy as np
 from mbkit.load.xml_reader import Element
 from mbkit.model import Coupler, Loop, Model
 from mbkit.model.elements.references import hung_on
-from mbkit.studies.explain.loops import exchanged, follows, moved, paired
+from mbkit.studies.explain.hypotheses import exchanged, follows, moved, paired
 from mbkit.studies.explain.merged_model import Tolerances
 
 #: Attributes that switch equalities off, by element.
@@ -62,8 +62,8 @@ def loop_differences(written: Written, read: Sequence[Any], near: Tolerances) ->
 
     def says(a: Loop, b: Loop) -> str:
         far, turn = moved(a, b)
-        texts = [] if far <= near.relative * near.length else [f"moved by {far:.3g} m"]
-        return " and ".join([*texts, *([] if turn <= near.relative else [f"turned by {turn:.3g} rad"])])
+        texts = [f"moved by {far:.3g} m"] * (far > near.relative * near.length)
+        return " and ".join(texts + [f"turned by {turn:.3g} rad"] * (turn > near.relative))
 
     return _differences(Loop, written, read, apart, says)
 
@@ -72,11 +72,13 @@ def coupler_differences(written: Written, file: Model, read: Sequence[Any], tole
     """Return the same of couplers: an importer may hold the file's mimic joints by them, or leave these free."""
 
     def apart(a: Coupler, b: Coupler) -> float:
-        return _off(a, b) if (a.joint, a.leaders) == (b.joint, b.leaders) else np.inf
+        numbers = zip(a._values()[3:], b._values()[3:], strict=True)
+        same = (a.joint, a.leaders) == (b.joint, b.leaders)
+        return sum(float(np.abs(x - y).sum()) for x, y in numbers) if same else np.inf
 
     def says(a: Coupler, b: Coupler) -> str:
         size = max(1.0, float(np.abs(a.ratio).sum()) + abs(a.offset))
-        return f"{follows(b)}, not {follows(a)}" if _off(a, b) > tolerance * size else ""
+        return f"{follows(b)}, not {follows(a)}" if apart(a, b) > tolerance * size else ""
 
     return _differences(Coupler, written, read, apart, says, lambda x: _is_mimicked(x, file, tolerance))
 
@@ -111,10 +113,6 @@ def _is_mimicked(x: Coupler, file: Model, tolerance: float) -> bool:
         total[name] = total.get(name, 0.0) + factor
     far = [offset, *total.values(), *x.curve]
     return bool(np.abs(far).max() <= tolerance * (1.0 + abs(x.offset) + np.abs(x.ratios).sum()))
-
-
-def _off(a: Coupler, b: Coupler) -> float:
-    return sum(float(np.abs(x - y).sum()) for x, y in zip(a._values()[3:], b._values()[3:], strict=True))
 
 
 def _ordered(x: Coupler) -> Coupler:

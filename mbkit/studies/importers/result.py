@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import PurePath
 from typing import ClassVar, Final
 
+from mbkit._check import by_key
 from mbkit.studies.document import Bullet, Column, Document, Items, Paragraph, Section, Span, Table
 from mbkit.studies.explain.result import Explanation, cause_blocks, meanings
 from mbkit.studies.explain.terms import TERMS
 from mbkit.studies.formatting import error_text
-from mbkit.studies.results import ResultTable, columns
+from mbkit.studies.results import ResultTable, columns, counted
 
 #: The name of the reference: the file as written.
 FILE: Final = "file"
@@ -67,6 +69,13 @@ class Parsed:
         return self.engine if "==" in self.engine else f"{self.engine} {self.version}"
 
     @property
+    def outcome(self) -> str:
+        """``"agree"``, ``"differ"``, ``"refuse"``, ``"missing"``, or ``"read"`` where there is no reference."""
+        if self.refused:
+            return "missing" if self.version == MISSING else "refuse"
+        return "read" if not self.stages else "agree" if self.agrees else "differ"
+
+    @property
     def agrees(self) -> bool:
         """Whether it moves as the reference does, mimic joints left free and loops open, and no cause acts."""
         causes = self.explanation.acting if self.explanation else ()
@@ -106,21 +115,23 @@ class ParserComparison(ResultTable):
     @property
     def verdict(self) -> str:
         """One sentence: which importers agree, differ, refuse or were not compared."""
-        same = [p.engine for p in self.importers if p.agrees]
-        differ = [p.engine for p in self.importers if p.stages and not p.agrees]
-        missing = [p.engine for p in self.importers if p.refused and p.version == MISSING]
-        refuse = [p.engine for p in self.importers if p.refused and p.engine not in missing]
-        alone = [p.engine for p in self.importers if not p.stages and not p.refused]
-        other = {s.name for p in self.importers if p.agrees for s in p.stages if not s.same}
-        other |= {c.kind for p in self.importers if p.agrees and p.explanation for c in p.explanation.causes}
+        names = by_key((p.outcome, p.engine) for p in self.importers)
+        alike = [p for p in self.importers if p.agrees]
+        other = {s.name for p in alike for s in p.stages if not s.same}
+        other |= {c.kind for p in alike if p.explanation for c in p.explanation.causes}
         apart = [what for name, what in _APART.items() if name in other]
-        parts = [f"{_listed(same)} agree{_s(same)} with the file as written"] if same else []
-        parts = [f"{x}, {_listed(apart)} apart" if apart else x for x in parts]
-        parts += [f"{_listed(differ)} differ{_s(differ)}"] if differ else []
-        parts += [f"{_listed(refuse)} refuse{_s(refuse)}"] if refuse else []
-        parts += [f"{_listed(missing)} {'is' if len(missing) == 1 else 'are'} not installed"] if missing else []
-        if alone:
-            parts.insert(0, f"not compared: mbkit does not read the file; {_listed(alone)} read{_s(alone)} it")
+        said = {
+            "read": "not compared: mbkit does not read the file; {names} read{s} it",
+            "agree": "{names} agree{s} with the file as written" + (f", {_listed(apart)} apart" if apart else ""),
+            "differ": "{names} differ{s}",
+            "refuse": "{names} refuse{s}",
+            "missing": "{names} {are} not installed",
+        }
+        parts = (
+            text.format(names=_listed(some), s="s" * (len(some) == 1), are="is" if len(some) == 1 else "are")
+            for outcome, text in said.items()
+            if (some := names.get(outcome))
+        )
         return "; ".join(parts) or "no importer was asked"
 
     @property
@@ -144,40 +155,33 @@ class ParserComparison(ResultTable):
         """Return the document of several importers of one file: their own terms, and why they differ."""
         name = PurePath(self.source).name
         read = [p for p in self.importers if p.stages]
-        alone = [p for p in self.importers if not p.stages and not p.refused]
+        alone = [p for p in self.importers if p.outcome == "read"]
         outcome = "agree" if self.agree else "differ" if read else "are not compared" if alone else "refuse"
-        rows = [p.stages for p in read]
         columns = [
-            Column("stage", lambda k: Span(rows[0][k].name, "bold")),
-            Column("", lambda k: Span(meanings()["stages"].get(rows[0][k].name, ""), "muted"), on="page"),
-            *(_importer(p) for p in read),
+            Column("stage", lambda rows: Span(rows[0].name, "bold")),
+            Column("", lambda rows: Span(meanings()["stages"].get(rows[0].name, ""), "muted"), on="page"),
+            *(Column(p.label, partial(_stage, k)) for k, p in enumerate(read)),
         ]
-        plural = "s" * (self.samples != 1)
         refused = [Bullet(p.label, p.refused, "✗", "bad") for p in self.importers if p.refused]
         notes = [Bullet("the file", note) for note in (*([self.faults] if self.faults else []), *self.notes)]
         notes += [Bullet(p.engine, note) for p in (*read, *alone) for note in p.notes]
-        fused = (
+        about = (
             "What an importer fuses is fused on the other side too; mimic joints are left free in M, g, nle and "
             f"passive, whose differences are relative to the forces at play and count above {self.tolerance:g}."
         )
+        stages = Table(columns, [*zip(*(p.stages for p in read), strict=True)], style="stages")
+        legends = (Paragraph(text, on="page", note=True) for text in (_LEGEND, about))
+        against = f", against the {self.against}" if self.against else ""
+        states = counted(self.samples, "random one")
         return Document(
             name=name,
             title=f"{name}: importers {outcome}",
             verdict=self.verdict,
-            sentence=_importers_sentence(self, read),
+            sentence=self._sentence(),
             good=self.agree,
-            opening=[Paragraph(_setting(self, read, alone), on="page")],
+            opening=[Paragraph(self._setting(bool(read), bool(alone)), on="page")],
             sections=[
-                Section(
-                    "Terms of each engine" + (f", against the {self.against}" if self.against else ""),
-                    [
-                        Table(columns, range(len(rows[0])), style="stages"),
-                        Paragraph(_LEGEND, on="page", note=True),
-                        Paragraph(fused, on="page", note=True),
-                    ]
-                    if read
-                    else [],
-                ),
+                Section(f"Terms of each engine{against}", [stages, *legends] if read else []),
                 *_differences(read),
                 Section("Refused", [Items(refused)]),
                 Section("Notes", [Items(notes)]),
@@ -185,36 +189,27 @@ class ParserComparison(ResultTable):
             result=self,
             basis={
                 "file": Span(self.source, "mono"),
-                "states": f"{self.samples} random one{plural}, seed {self.seed}; M, g, nle and passive are each "
-                "engine's own, on its own model",
+                "states": f"{states}, seed {self.seed}; M, g, nle and passive are each engine's own, on its own model",
             },
         )
 
+    def _sentence(self) -> str:
+        """Return the verdict with the digits on which terms agree, and at how many states."""
+        terms = [s for p in self.importers if p.agrees for s in p.stages if s.name in TERMS and s.same]
+        worst = max((s.worst for s in terms if math.isfinite(s.worst)), default=0.0)
+        if not worst:
+            return self.verdict
+        digits = f"{', '.join(dict.fromkeys(s.name for s in terms))} to {-math.log10(worst):.1f} digits or more"
+        return f"{self.verdict}; where they agree, {digits} at {counted(self.samples, 'state')}"
 
-def _importers_sentence(result: ParserComparison, read: list[Parsed]) -> str:
-    """Return the verdict with the digits on which terms agree, and at how many states."""
-    terms = [s for p in read if p.agrees for s in p.stages if s.name in TERMS and s.same]
-    worst = max((s.worst for s in terms if math.isfinite(s.worst)), default=0.0)
-    if not worst:
-        return result.verdict
-    names = ", ".join(dict.fromkeys(s.name for s in terms))
-    states = f"{result.samples} state{'s' * (result.samples != 1)}"
-    return f"{result.verdict}; where they agree, {names} to {-math.log10(worst):.1f} digits or more at {states}"
-
-
-def _importer(p: Parsed) -> Column:
-    return Column(p.label, lambda k: _stage(p.stages[k]))
-
-
-def _setting(result: ParserComparison, read: list[Parsed], alone: list[Parsed]) -> str:
-    """Return what was done with the file, in words."""
-    head = f"The same {'URDF' if result.format == 'urdf' else 'MJCF'} was read by each engine's own importer"
-    if not read:
-        why = "" if result.reference else ", because mbkit itself does not read the file"
-        return f"{head}. Nothing is compared{why}." if alone else f"{head}, and none reads it."
-    still = "stands still" if result.format == "urdf" else "is as the file has it"
-    base = "floats" if result.floating_base else still
-    return f"{head}. What came out is compared with the {result.against}; the base {base}."
+    def _setting(self, read: bool, alone: bool) -> str:
+        """Return what was done with the file, in words."""
+        head = f"The same {self.format.upper()} was read by each engine's own importer"
+        if not read:
+            why = "" if self.reference else ", because mbkit itself does not read the file"
+            return f"{head}. Nothing is compared{why}." if alone else f"{head}, and none reads it."
+        base = "floats" if self.floating_base else "stands still" if self.format == "urdf" else "is as the file has it"
+        return f"{head}. What came out is compared with the {self.against}; the base {base}."
 
 
 def _differences(read: list[Parsed]) -> Iterator[Section]:
@@ -236,8 +231,9 @@ def _differences(read: list[Parsed]) -> Iterator[Section]:
         yield Section(f"Why they differ: {title}", [about, *cause_blocks(why.causes, ("mimic",))])
 
 
-def _stage(stage: Stage) -> Span:
-    """Return a stage as mark, word and what differs."""
+def _stage(k: int, stages: Sequence[Stage]) -> Span:
+    """Return the stage of an importer as mark, word and what differs."""
+    stage = stages[k]
     if stage.same is None:
         return Span("– not comparable" + (f": {stage.says}" if stage.says else ""), "muted", "none")
     number = error_text(stage.worst) if stage.name in TERMS and math.isfinite(stage.worst) else ""
@@ -246,10 +242,6 @@ def _stage(stage: Stage) -> Span:
     joint = f", most at {stage.where}" if stage.where else ""
     says = f" by {number}{joint}" if number else f": {stage.says}"
     return Span(f"✗ differs{says}", "bad", "differs") if stage.name in DECIDING else Span(f"! differs{says}", "allowed")
-
-
-def _s(names: list[str]) -> str:
-    return "s" if len(names) == 1 else ""
 
 
 def _listed(names: list[str]) -> str:

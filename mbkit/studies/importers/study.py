@@ -194,14 +194,12 @@ def stages(
         own = model_terms(free.smooth, at)
         own["passive"] = own["passive"] + DryFrictionLaw(free).force(at.v)
         apart = gaps(own, _own_terms_of(free, imported, there, at), at, free)
-    by_term = {g.term: g for g in apart}
-    for name in TERMS:
-        if g := by_term.get(name):
-            says = f"{g.relative:.1e} at {g.joint}"
-            out.append(Stage(name, g.relative <= tolerance, g.relative, g.joint, says))
-        else:
-            out.append(Stage(name, None, math.nan, "", "not computed" if apart else "other coordinates"))
-    return tuple(out)
+    found = {
+        g.term: Stage(g.term, g.relative <= tolerance, g.relative, g.joint, f"{g.relative:.1e} at {g.joint}")
+        for g in apart
+    }
+    unknown = None, math.nan, "", "not computed" if apart else "other coordinates"
+    return (*out, *(found.get(name) or Stage(name, *unknown) for name in TERMS))
 
 
 def _missing(name: str, missing: list[str], what: str) -> Stage:

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-TYPE_CHECKING = False
-if TYPE_CHECKING:
-    from typing import Any
+import numpy as np
 
 
 def center_of(masses: Any, points: Any) -> list[Any]:
-    """Return the total mass, kg, and the centre of masses at points, m, for each of a stack of states."""
-    return [np.full(len(points), masses.sum()), np.einsum("b,nbi->ni", masses, points) / masses.sum()]
+    """Return the total mass, kg, and the centre of masses at points, m, of a state or a stack of them."""
+    return [np.full(points.shape[:-2], masses.sum()), masses @ points / masses.sum()]
+
+
+def run(q: Any, v: Any, steps: int, step: Any) -> list[Any]:
+    """Return q and v of a state or a stack, and after each step: ``step(k)`` returns views of them."""
+    out = [(np.array(q), np.array(v))]
+    for k in range(steps):
+        q, v = step(k)
+        out.append((np.array(q, float), np.array(v, float)))
+    return [np.stack(x, axis=-2) for x in zip(*out, strict=True)]
 
 
 def apply(A: Any, x: Any) -> Any:

@@ -5,12 +5,10 @@ The parser and the compiler are MuJoCo's. A number is that of the engine's own m
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
-
-TYPE_CHECKING = False
-if TYPE_CHECKING:
-    from typing import Any
 
 #: How numbers of MuJoCo's model begin that describe bodies and joints, and what acts on them.
 _PARTS = ("body_", "jnt_", "dof_", "qpos", "eq_", "tendon_", "wrap_", "actuator_", "site_")

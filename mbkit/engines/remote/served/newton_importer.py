@@ -10,31 +10,26 @@ import re
 import warnings
 import xml.etree.ElementTree as ET
 from collections import Counter
+from typing import Any
 
 import newton
 import numpy as np
 from common import rotation
-from on_newton import NUMBERS, Engine
-
-TYPE_CHECKING = False
-if TYPE_CHECKING:
-    from typing import Any
+from on_newton import Engine
 
 _KINDS = {"REVOLUTE": "revolute", "PRISMATIC": "prismatic", "BALL": "ball", "FREE": "free", "FIXED": "fixed"}
 #: Text of its validation about a body.
 _OF_BODY = re.compile(r"for body '([^']+)'")
 #: Newton's numbers of velocities, and the description's.
 _NUMBERS = {
-    **{name: f"joint_{NUMBERS[name]}" for name in ("rotors", "damping", "stiffness")},
-    "friction": "joint_friction",
-    "lower": "joint_limit_lower",
-    "upper": "joint_limit_upper",
-    "velocity_limit": "joint_velocity_limit",
-    "effort_limit": "joint_effort_limit",
+    **{name: f"joint_{name}" for name in ("armature", "damping", "stiffness", "friction")},
+    **{name: f"joint_limit_{name}" for name in ("lower", "upper")},
+    **{name: f"joint_{name}" for name in ("velocity_limit", "effort_limit")},
 }
 #: Those of joints of several velocities too.
-_OF_ALL = ("rotors", "damping", "friction")
-_LIMITS = ("lower", "upper", "velocity_limit", "effort_limit")
+_OF_ALL = ("armature", "damping", "friction")
+#: A limit beyond this is none.
+_NO_LIMIT = 1e5
 
 
 class Imported(Engine):  # type: ignore[misc]  # of the file beside
@@ -104,6 +99,8 @@ class _Description:
         self._labels = m.joint_label, m.body_label
         held = {k: getattr(m, x, None) for k, x in _NUMBERS.items()}
         self._of = {k: x.numpy().astype(float) for k, x in held.items() if x is not None}
+        for some in (x for k, x in self._of.items() if "limit" in _NUMBERS[k]):
+            some[np.abs(some) > _NO_LIMIT] *= np.inf
         self._drive()
         axes, dims = m.joint_axis.numpy().astype(float), m.joint_dof_dim.numpy()
         starts = (
@@ -136,7 +133,6 @@ class _Description:
                     self.data["bodies"].append([body, 0.0, [0.0] * 3, np.zeros((3, 3)).tolist()])
                 some = self._of if len(at_v) == 1 else {x: self._of[x] for x in _OF_ALL if x in self._of}
                 numbers = {x: y[at_v].tolist() for x, y in some.items()}
-                numbers |= {x: [None if abs(y) > 1e5 else y for y in numbers[x]] for x in _LIMITS if x in numbers}
                 if not any(numbers.get("stiffness", [])):
                     numbers.pop("rest", None)
                 one = {"axes": axes[at_v].tolist()} if len(at_v) == 1 else {}

@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody import tree
 from pydrake.multibody.plant import MultibodyPlant
-
-try:
-    from importlib.metadata import version as _version
-
-    VERSION = _version("drake")
-except Exception:  # no metadata, as of a build from source
-    VERSION = "unknown"
-
-TYPE_CHECKING = False
-if TYPE_CHECKING:
-    from typing import Any
 
 
 def built(data: dict[str, Any]) -> Any:

@@ -5,21 +5,14 @@ The parser and the compiler are MuJoCo's. JAX computes in double precision where
 
 from __future__ import annotations
 
-from importlib.metadata import version
+from typing import Any
 
 import jax
-import mujoco
 import numpy as np
-from common import center_of
 from mujoco import mjx
-from on_mujoco import body_of, built, places, smooth
+from on_mujoco import OfMujoco, body_of, built, integrator, smooth
 
-TYPE_CHECKING = False
-if TYPE_CHECKING:
-    from typing import Any
-
-__all__ = ["VERSION", "Engine", "built"]
-VERSION = version("mujoco-mjx")
+__all__ = ["Engine", "built"]
 #: The smallest stack that is compiled, beside one state alone; larger ones have twice as many, and so on.
 _MIN_STACK = 16
 
@@ -29,7 +22,7 @@ def put(m: Any) -> Any:
     return mjx.put_model(m)
 
 
-class Engine:
+class Engine(OfMujoco):  # type: ignore[misc]  # of the file beside
     """A model on JAX, with all off that its smooth dynamics do not need. Each method takes a stack of states."""
 
     STACKED = True
@@ -40,10 +33,6 @@ class Engine:
         self._d = mjx.make_data(self._mx)
         self._gravity = np.array(m.opt.gravity)
         self._compiled: dict[Any, Any] = {}
-
-    def joints(self) -> Any:
-        """Return the places of each joint's numbers in qpos and qvel."""
-        return places(self._m)
 
     def _over(self, key: Any, function: Any, *states: Any, shared: tuple[Any, ...] = ()) -> Any:
         """Return a function of one state at each of a stack, compiled once for each size of a stack."""
@@ -71,22 +60,6 @@ class Engine:
         v = np.zeros((len(q), self._m.nv)) if v is None else v
         return self._over("terms", terms, q, v, shared=(self._gravity if gravity is None else gravity,))
 
-    def mass_matrix(self, q: Any) -> Any:
-        return self._terms(q)[0]
-
-    def gravity(self, q: Any) -> Any:
-        return self._terms(q)[1]
-
-    def nle(self, q: Any, v: Any) -> Any:
-        return self._terms(q, v)[1]
-
-    def coriolis_force(self, q: Any, v: Any) -> Any:
-        # Without gravity, so that nothing cancels.
-        return self._terms(q, v, np.zeros(3))[1]
-
-    def passive(self, q: Any, v: Any) -> Any:
-        return self._terms(q, v)[2]
-
     def inverse_dynamics(self, q: Any, v: Any, a: Any) -> Any:
         def inverse(q: Any, v: Any, a: Any) -> Any:
             return mjx.inverse(self._mx, self._d.replace(qpos=q, qvel=v, qacc=a)).qfrc_inverse
@@ -109,19 +82,12 @@ class Engine:
 
         return self._over("frame", frame, q, shared=(body_of(self._m, body),))
 
-    def matter(self, q: Any) -> Any:
-        """Return the mass of what moves and stands, kg, and its centre of mass, m."""
-        return center_of(np.array(self._m.body_mass), self._terms(q)[3])
-
     def rollout(self, q: Any, v: Any, tau: Any = None, *, method: str, dt: float, steps: int) -> Any:
         """Return qpos and qvel after each of so many steps; tau is held over each, (n, steps, nv)."""
-        kind = {"euler": "EULER", "rk4": "RK4", "implicitfast": "IMPLICITFAST"}.get(method)
-        if kind is None:
-            raise NotImplementedError(f"MJX has no integrator {method!r}; it has euler, rk4 and implicitfast")
-        integrator = int(getattr(mujoco.mjtIntegrator, "mjINT_" + kind))
+        number = integrator(method)
 
         def run(q: Any, v: Any, tau: Any, dt: Any) -> Any:
-            mx = self._mx.replace(opt=self._mx.opt.replace(timestep=dt, integrator=integrator))
+            mx = self._mx.replace(opt=self._mx.opt.replace(timestep=dt, integrator=number))
 
             def step(d: Any, tau: Any) -> Any:
                 d = mjx.step(mx, d.replace(qfrc_applied=tau))

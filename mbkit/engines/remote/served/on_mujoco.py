@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
+from common import center_of, run
 
-TYPE_CHECKING = False
-if TYPE_CHECKING:
-    from typing import Any
-
-VERSION = mujoco.__version__
+METHODS = ("euler", "implicitfast", "rk4")
 _OFF = (
     *("CONTACT", "LIMIT", "FRICTIONLOSS", "EQUALITY", "CONSTRAINT", "ACTUATION", "SENSOR"),
     *("EULERDAMP", "AUTORESET", "WARMSTART", "ISLAND"),
@@ -54,95 +53,112 @@ def _plain(number: Any) -> int:
     return int(np.ravel(number)[0])
 
 
-class Engine:
-    """A compiled model, with all off that its smooth dynamics do not need."""
+def integrator(method: str) -> int:
+    """Return the number of an integrator that MuJoCo and its kin have."""
+    if method not in METHODS:
+        raise NotImplementedError(f"no integrator {method!r} here; there are {', '.join(METHODS)}")
+    return int(getattr(mujoco.mjtIntegrator, "mjINT_" + method.upper()))
 
-    def __init__(self, m: Any) -> None:
-        self._m, self._d = smooth(m), mujoco.MjData(m)
-        # Older ones compute no energy without it.
-        m.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+
+class OfMujoco:
+    """Quantities of MuJoCo's model ``_m``, on MuJoCo or its kin, at a state or a stack of them.
+
+    ``_terms(q, v, gravity)`` are M, the bias and passive forces, and each body's centre of mass; by default at rest and
+    in the model's gravity.
+    """
+
+    _m: Any
+    _terms: Any
 
     def joints(self) -> dict[str, Any]:
         return places(self._m)
 
-    def _set(self, q: Any, v: Any = None) -> Any:
-        d = self._d
-        d.qpos[:] = q
-        d.qvel[:] = 0.0 if v is None else v
-        mujoco.mj_fwdPosition(self._m, d)
-        mujoco.mj_fwdVelocity(self._m, d)
-        return d
-
     def mass_matrix(self, q: Any) -> Any:
-        d, out = self._set(q), np.zeros((self._m.nv, self._m.nv))
-        try:
-            mujoco.mj_fullM(self._m, d, out)
-        except TypeError:
-            # Older ones take the entries of the sparse matrix.
-            mujoco.mj_fullM(self._m, out, d.qM)
-        return out
+        return self._terms(q)[0]
 
     def gravity(self, q: Any) -> Any:
-        return np.array(self._set(q).qfrc_bias)
+        return self._terms(q)[1]
 
     def nle(self, q: Any, v: Any) -> Any:
-        return np.array(self._set(q, v).qfrc_bias)
+        return self._terms(q, v)[1]
 
     def coriolis_force(self, q: Any, v: Any) -> Any:
         # Without gravity, so that nothing cancels.
-        before = np.array(self._m.opt.gravity)
-        self._m.opt.gravity[:] = 0.0
-        try:
-            return self.nle(q, v)
-        finally:
-            self._m.opt.gravity[:] = before
+        return self._terms(q, v, np.zeros(3))[1]
 
     def passive(self, q: Any, v: Any) -> Any:
-        return np.array(self._set(q, v).qfrc_passive)
+        return self._terms(q, v)[2]
+
+    def matter(self, q: Any) -> Any:
+        """Return the mass of what moves and stands, kg, and its centre of mass, m."""
+        return center_of(np.array(self._m.body_mass), self._terms(q)[3])
+
+
+class Engine(OfMujoco):
+    """A compiled model, with all off that its smooth dynamics do not need."""
+
+    def __init__(self, m: Any) -> None:
+        self._m, self._d, self._gravity = smooth(m), mujoco.MjData(m), np.array(m.opt.gravity)
+        # Older ones compute no energy without it.
+        m.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+
+    def _set(self, q: Any, v: Any = 0.0, gravity: Any = None, tau: Any = 0.0) -> Any:
+        d = self._d
+        d.qpos[:], d.qvel[:], d.qfrc_applied[:] = q, v, tau
+        self._m.opt.gravity[:] = self._gravity if gravity is None else gravity
+        return d
+
+    def _terms(self, *state: Any) -> Any:
+        d, M = self._set(*state), np.zeros((self._m.nv, self._m.nv))
+        mujoco.mj_fwdPosition(self._m, d)
+        mujoco.mj_fwdVelocity(self._m, d)
+        try:
+            mujoco.mj_fullM(self._m, d, M)
+        except TypeError:
+            # Older ones take the entries of the sparse matrix.
+            mujoco.mj_fullM(self._m, M, d.qM)
+        return [M, *map(np.array, (d.qfrc_bias, d.qfrc_passive, d.xipos))]
 
     def inverse_dynamics(self, q: Any, v: Any, a: Any) -> Any:
-        self._d.qpos[:], self._d.qvel[:], self._d.qacc[:] = q, v, a
+        self._set(q, v).qacc[:] = a
         mujoco.mj_inverse(self._m, self._d)
         return np.array(self._d.qfrc_inverse)
 
     def forward_dynamics(self, q: Any, v: Any, tau: Any) -> Any:
-        self._d.qpos[:], self._d.qvel[:], self._d.qfrc_applied[:] = q, v, tau
-        mujoco.mj_forward(self._m, self._d)
-        self._d.qfrc_applied[:] = 0.0
+        mujoco.mj_forward(self._m, self._set(q, v, tau=tau))
         return np.array(self._d.qacc)
 
     def kinetic_energy(self, q: Any, v: Any) -> Any:
-        mujoco.mj_energyVel(self._m, self._set(q, v))
+        self._terms(q, v)
+        mujoco.mj_energyVel(self._m, self._d)
         return self._d.energy[1]
 
     def potential_energy(self, q: Any) -> Any:
-        mujoco.mj_energyPos(self._m, self._set(q))
+        self._terms(q)
+        mujoco.mj_energyPos(self._m, self._d)
         return self._d.energy[0]
 
     def frame(self, q: Any, body: str) -> Any:
         """Return R_WB, p_WB, and the Jacobians of the body's origin and turning in world axes."""
-        d, k = self._set(q), body_of(self._m, body)
+        self._terms(q)
+        d, k = self._d, body_of(self._m, body)
         linear, angular = np.zeros((3, self._m.nv)), np.zeros((3, self._m.nv))
         mujoco.mj_jacBody(self._m, d, linear, angular, k)
         return [np.array(d.xmat[k]).reshape(3, 3), np.array(d.xpos[k]), linear, angular]
 
-    def matter(self, q: Any) -> Any:
-        """Return the mass of what moves and stands, kg, and its centre of mass, m."""
-        d, masses = self._set(q), np.array(self._m.body_mass)
-        return [masses.sum(), masses @ np.array(d.xipos) / masses.sum()]
-
     def rollout(self, q: Any, v: Any, tau: Any = None, *, method: str, dt: float, steps: int) -> Any:
         """Return qpos and qvel after each of so many steps; tau is held over each, (steps, nv)."""
-        m = self._m
+        m, d = self._m, mujoco.MjData(self._m)
         before = m.opt.integrator, m.opt.timestep
+        self._set(q)
         m.opt.integrator, m.opt.timestep = int(getattr(mujoco.mjtIntegrator, "mjINT_" + method.upper())), dt
-        d = mujoco.MjData(m)
         d.qpos[:], d.qvel[:] = q, v
-        out_q, out_v = [np.array(q)], [np.array(v)]
-        for k in range(steps):
+
+        def step(k: int) -> Any:
             d.qfrc_applied[:] = 0.0 if tau is None else tau[k]
             mujoco.mj_step(m, d)
-            out_q.append(np.array(d.qpos))
-            out_v.append(np.array(d.qvel))
+            return d.qpos, d.qvel
+
+        out = run(q, v, steps, step)
         m.opt.integrator, m.opt.timestep = before
-        return [np.array(out_q), np.array(out_v)]
+        return out

@@ -6,17 +6,15 @@ the body's origin, v_G = v + ω × R c, so that quantities are turned into it, i
 
 from __future__ import annotations
 
+from typing import Any
+
 import newton
 import numpy as np
 import warp as wp
-from common import apply, center_of, rotation, skew
+from common import apply, center_of, rotation, run, skew
 
-TYPE_CHECKING = False
-if TYPE_CHECKING:
-    from typing import Any
 wp.config.quiet = True
 _OF_MUJOCO = ("euler", "implicitfast", "rk4")
-VERSION = newton.__version__
 #: Numbers of a joint with one velocity, as Newton calls them.
 NUMBERS = {"rotors": "armature", "damping": "damping", "stiffness": "stiffness", "rest": "rest_q"}
 
@@ -205,15 +203,17 @@ class Engine:
         """
         model, state, *_ = self._set(q, v, passive=True)
         solver = self._solver(model, len(q), method)
-        out, after, control = [(np.array(q), np.array(v))], model.state(), model.control()
-        for k in range(steps):
+        both, control = [state, model.state()], model.control()
+
+        def step(k: int) -> Any:
             if tau is not None:
                 control.joint_f.assign(tau[:, k].ravel())
-            solver.step(state, after, control, None, dt)
-            state, after = after, state
-            x, u = (np.array(y.numpy(), float).reshape(len(q), -1) for y in (state.joint_q, state.joint_qd))
-            out.append((x, apply(np.linalg.inv(self._centre(x)), u)))
-        return [np.stack(x, axis=1) for x in zip(*out, strict=True)]
+            solver.step(*both, control, None, dt)
+            both.reverse()
+            x, u = (np.array(y.numpy(), float).reshape(len(q), -1) for y in (both[0].joint_q, both[0].joint_qd))
+            return x, apply(np.linalg.inv(self._centre(x)), u)
+
+        return run(q, v, steps, step)
 
     def frame(self, q: Any, body: str) -> Any:
         """Return R_WB, p_WB, and the Jacobians of the body's origin and turning in world axes."""

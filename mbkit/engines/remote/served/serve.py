@@ -16,14 +16,11 @@ import shutil
 import signal
 import sys
 import threading
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
+from typing import Any
 
 import numpy as np
-
-TYPE_CHECKING = False
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from typing import Any
 
 #: SIGUSR1, which Linux sends when the parent is gone. Its handler is alarm(2), which takes the signal's number as
 #: seconds: time to remove the folder, after which the kernel ends even a process that hangs in a library.
@@ -107,17 +104,16 @@ def _module(name: str) -> Any:
 def _answer(adapter: Any, held: dict[int, Any], head: dict[str, Any], arrays: list[Any]) -> bytes:
     """Return what a call gives: of the adapter's class, or a quantity of a model that the process holds."""
     name, key = head["call"], head.get("model", 0)
-    if name == "build":
-        held[key] = adapter.Engine(adapter.built(head["with"]))
-        return packed({"joints": held[key].joints()})
-    if name == "import":
-        held[key], said = _module(head["with"].pop("module")).imported(adapter, **head["with"])
-        return packed(said)
+    if name in ("build", "import"):
+        if name == "build":
+            held[key] = adapter.Engine(adapter.built(head["with"]))
+            said = {"places": held[key].joints()}
+        else:
+            held[key], said = _module(head["with"].pop("module")).imported(adapter, **head["with"])
+        return packed({**said, "gives": [x for x in dir(adapter.Engine) if x[0] != "_"]})
     if name == "forget":
         held.pop(key, None)
         return packed({})
-    if name == "about":
-        return packed({"version": adapter.VERSION, "gives": [x for x in dir(adapter.Engine) if x[0] != "_"]})
     return packed({}, _called(held[key], name, arrays, head["with"], head.get("stacked", False)))
 
 
