@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Any, Final
+from functools import partial
+from typing import Any, Final, TypeVar, cast
 
 import mpmath as mp
 import numpy as np
@@ -17,13 +17,9 @@ from mbkit._check import EPS, Array
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import MbkitError, NumericalError
-from mbkit.methods.registry import (
-    ADAPTIVE_METHOD,
-    AUTOMATIC_METHOD,
-    METHODS,
-    STIFF_METHOD,
-)
-from mbkit.simulate import simulate
+from mbkit.methods.registry import ADAPTIVE_METHOD, AUTOMATIC_METHOD, METHODS, STIFF_METHOD
+from mbkit.model import Model
+from mbkit.simulate import Trajectory, simulate
 from mbkit.studies.compare.errors import Scales, interleaved
 from mbkit.studies.compare.terms import FORWARD_DYNAMICS, States
 from mbkit.studies.compare.terms import TERMS as COMPARED
@@ -41,36 +37,33 @@ _MAX_RELATIVE_FLOOR: Final = 1e-3
 
 def reference_motion(problem: Problem, times: Array, wanted: float, seconds: float) -> tuple[Truth | None, str]:
     """Return the truth of a motion to `wanted` of it, or None, and how it is known or why it is not."""
-    if problem.exact is not None:
-        return _closed_form(problem, times)
-    motion = problem.model, problem.q, problem.v, float(times[-1]), times, problem.tau
     try:
-        known = reference(*motion, seconds=seconds, wanted=wanted, agree=_MAX_RELATIVE_FLOOR)
+        truth = _closed_form(problem, times) if problem.exact else _searched(problem, times, wanted, seconds)
     except MbkitError as error:
         return None, f"no truth: {error}"
+    return truth, f"{truth.how}; known to {truth.floor:.1e}"
+
+
+def _searched(problem: Problem, times: Array, wanted: float, seconds: float) -> Truth:
+    motion = problem.model, problem.q, problem.v, float(times[-1]), times, problem.tau
+    known = reference(*motion, seconds=seconds, wanted=wanted, agree=_MAX_RELATIVE_FLOOR)
     if len(known.t) < len(times):
-        return None, f"no truth: {known.how}"
-    floor = float(known.floor.max())
-    return Truth(times, known.q, floor, known.how), f"{known.how}; known to {floor:.1e}"
+        raise NumericalError(known.how)
+    return Truth(times, known.q, float(known.floor.max()), known.how)
 
 
-def _closed_form(problem: Problem, times: Array) -> tuple[Truth | None, str]:
+def _closed_form(problem: Problem, times: Array) -> Truth:
     assert problem.exact is not None
-    exact: Any = problem.exact(times)
-    q = np.asarray(exact, dtype=np.float64)
-    if q.shape != (len(times), problem.model.nq) or not np.isfinite(q).all():
-        what = f"shape {q.shape}" if q.shape != (len(times), problem.model.nq) else "numbers that are not finite"
-        return None, f"no truth: the closed form gave {what}, expected ({len(times)}, {problem.model.nq})"
-    start = float(np.abs(problem.model.difference(np.asarray(problem.q, dtype=np.float64), q[0])).max())
-    floor = max(problem.floor, _rounding(q))
+    model, q = problem.model, np.asarray(problem.exact(times), dtype=np.float64)
+    if q.shape != (len(times), model.nq) or not np.isfinite(q).all():
+        what = f"shape {q.shape}" if q.shape != (len(times), model.nq) else "numbers that are not finite"
+        raise NumericalError(f"the closed form gave {what}, expected ({len(times)}, {model.nq})")
+    start = float(np.abs(model.difference(np.asarray(problem.q, dtype=np.float64), q[0])).max())
+    # A motion is rounded to double.
+    floor = max(problem.floor, 0.5 * EPS * float(np.abs(q).max()))
     if start > max(1e-9 * problem.scale, 2 * floor):
-        return None, f"no truth: the closed form starts {start:.1e} from q; it is of another motion"
-    return Truth(times, q, floor, problem.source), f"{problem.source or 'closed form'}; known to {floor:.1e}"
-
-
-def _rounding(q: Array) -> float:
-    """Return the error of rounding a motion to double."""
-    return 0.5 * EPS * float(np.abs(q).max())
+        raise NumericalError(f"the closed form starts {start:.1e} from q; it is of another motion")
+    return Truth(times, q, floor, problem.source or "closed form")
 
 
 # Reference terms. Errors are those of `mbkit.studies.compare.errors`, but for forward dynamics: there its error is
@@ -193,54 +186,51 @@ class Limits:
         return max(_MIN_PREPARATION_SECONDS, _PREPARATION_PER_RUN_TIME * self.seconds)
 
 
-class _ValueCache:
-    """Problem, oracle and engines of one value of a case, for all calls about it."""
-
-    def __init__(self, case: Case, value: float) -> None:
-        self.case, self.value = case, value
-        self.problem = problem_of(case, value)
-        #: Engine -> dynamics, and the warnings of its construction.
-        self.engines: dict[str, tuple[Dynamics, list[str]]] = {}
-
-    @cached_property
-    def oracle(self) -> OracleDynamics:
-        return OracleDynamics(self.problem.model)
-
-    def dynamics(self, engine: str) -> tuple[Dynamics, list[str]]:
-        if engine not in self.engines:
-            with heard_warnings() as heard:
-                dyn = dynamics(self.problem.model, engine)
-            self.engines[engine] = dyn, heard
-        return self.engines[engine]
+T = TypeVar("T")
+#: Problem, oracle and engines of one value of a case, for all calls about it.
+_cache: Final[dict[Any, Any]] = {}
 
 
-_cache: Final[dict[tuple[str, float], _ValueCache]] = {}
-
-
-def _value_of(case: Case, value: float) -> _ValueCache:
-    """Return the cache of a value, and free that of the value before."""
-    key = case.name, value
-    if key not in _cache:
+def _cached(case: Case, value: float, name: str, make: Callable[[], T]) -> T:
+    """Return what was made before for this value, or make it; that of the value before is freed."""
+    if _cache.get(None) != (case.name, value):
         _cache.clear()
-        _cache[key] = _ValueCache(case, value)
-    return _cache[key]
+        _cache[None] = case.name, value
+    if name not in _cache:
+        _cache[name] = make()
+    made: T = _cache[name]
+    return made
+
+
+def _problem(case: Case, value: float) -> Problem:
+    return _cached(case, value, "problem", partial(problem_of, case, value))
+
+
+def _oracle(case: Case, value: float) -> OracleDynamics:
+    return _cached(case, value, "oracle", partial(OracleDynamics, _problem(case, value).model))
+
+
+def _engine(model: Model, engine: str) -> tuple[Dynamics, list[str]]:
+    """Return an engine, and the warnings of its construction."""
+    with heard_warnings() as heard:
+        dyn = dynamics(model, engine)
+    return dyn, heard
 
 
 def prepare(case: Case, value: float, bar: float, seconds: float) -> Prepared:
     """Return the reference of a value, searched for within so many seconds of processor time."""
-    cache = _value_of(case, value)
-    problem = cache.problem
+    problem = _problem(case, value)
     truth: Truth | Terms | None = None
     report_stage("truth")
     if case.measure == "terms":
-        how, truth = "the own derivation with 34 digits", reference_terms(problem, cache.oracle)
+        how, truth = "the own derivation with 34 digits", reference_terms(problem, _oracle(case, value))
     elif case.measure == "energy":
         how = "the energy at the start, with 34 digits"
     else:
         truth, how = reference_motion(problem, times_of(problem, case.measure), 0.1 * bar, seconds)
     facts = {name: float(x) for name, x in problem.facts.items()}
     with suppress(MbkitError):
-        number = condition(cache.oracle, problem.q)
+        number = condition(_oracle(case, value), problem.q)
         facts |= {} if "cond(M)" in facts or math.isnan(number) else {"cond(M)": number}
     return Prepared(how, truth, facts, problem.dt)
 
@@ -249,70 +239,75 @@ def measure(
     case: Case, value: float, engine: str, method: str, limits: Limits, truth: Truth | Terms | None
 ) -> Measurement:
     """Return one cell: a run by a method, or the evaluation of the term of this name, timed, and its error."""
-    cache = _value_of(case, value)
+    problem = _problem(case, value)
     report_stage("engine")
-    dyn, heard = cache.dynamics(engine)
+    dyn, heard = _cached(case, value, f"engine {engine}", partial(_engine, problem.model, engine))
     if isinstance(truth, Terms):
-        cell = _evaluate(cache, method, dyn, truth)
+        cell = _evaluate(problem, method, dyn, truth)
     elif case.measure == "terms":
         return Measurement(value, "not run", note="not run: no truth")
     else:
-        cell = _integrate(cache, method, limits, dyn, truth)
+        judge = dyn if truth is not None else _oracle(case, value)
+        cell = _integrate(problem, times_of(problem, case.measure), method, limits, dyn, truth, judge)
+        if case.measure == "energy" and cell.end == "finished":
+            cell = replace(cell, error=cell.energy)
     # A warning of the engine's construction holds for all that it does.
-    return replace(cell, warnings=(*heard, *cell.warnings)) if cell.end == "finished" else cell
+    warned = (*heard, *cell.warnings) if cell.end == "finished" else cell.warnings
+    return replace(cell, value=value, warnings=warned)
 
 
-def _integrate(cache: _ValueCache, method: str, limits: Limits, dyn: Dynamics, truth: Truth | None) -> Measurement:
-    value, problem = cache.value, cache.problem
-    times = times_of(problem, cache.case.measure)
-    kind = METHODS[method]
+def _integrate(
+    problem: Problem, times: Array, method: str, limits: Limits, dyn: Dynamics, truth: Truth | None, judge: Dynamics
+) -> Measurement:
+    """Return the measurement of a run; `judge` has more digits of the energy than a run that it alone judges."""
+    kind, duration = METHODS[method], float(times[-1])
     adaptive = kind.kind == "adaptive"
     dt = 0.0 if adaptive else step_of(problem, times, limits.dt)
-    step: dict[str, Any] = {"rtol": max(limits.rtol, kind.least)} if adaptive else {"dt": dt}
-    step["torque"] = problem.tau
-    start, duration = (dyn, problem.q, problem.v), float(times[-1])
+    setting: dict[str, Any] = {"rtol": max(limits.rtol, kind.least)} if adaptive else {"dt": dt}
+
+    def run(end: float, name: str, call: Any = quiet_simulate, seconds: float = math.inf, **more: Any) -> Trajectory:
+        look = None if math.isinf(seconds) else Deadline(seconds, clock=_clock).look
+        more = {"save": [end], "torque": problem.tau, "progress": look, **setting, **more}
+        return cast("Trajectory", call(dyn, problem.q, problem.v, end, name, **more))
+
     report_stage("method")
     try:
         short = _COMPILING_INTERVAL_PART * float(times[1]) if adaptive else dt
         for name in (*_SWITCHES_TO.get(method, ()), method):
-            quiet_simulate(*start, short, name, save=[short], **step)
+            run(short, name)
         if method in _SWITCHES_TO:
             # The controller's own functions are compiled when it first uses them.
-            look = Deadline(_UNTIMED_PER_RUN_TIME * limits.seconds, clock=_clock).look
-            quiet_simulate(*start, duration, method, save=times, progress=look, **step)
+            run(duration, method, save=times, seconds=_UNTIMED_PER_RUN_TIME * limits.seconds)
         report_stage("run")
         steps = round(duration / dt) if kind.kind == "native" else 0
         if steps >= 2 * _TRIAL_STEPS:
             # An engine's own integrator does not stop when it is asked to.
             begun = _clock()
-            quiet_simulate(*start, _TRIAL_STEPS * dt, method, save=[_TRIAL_STEPS * dt], **step)
+            run(_TRIAL_STEPS * dt, method)
             expected = (_clock() - begun) * steps / _TRIAL_STEPS
             if expected > limits.seconds:
-                return Measurement(value, "slow", note=f"not run: {steps} steps would take {expected:.2g} s")
+                return Measurement(0.0, "slow", note=f"not run: {steps} steps would take {expected:.2g} s")
         with heard_warnings() as heard:
             begun = _clock()
-            look = Deadline(limits.seconds, clock=_clock).look
-            run = simulate(*start, duration, method, save=times, progress=look, doubt=False, **step)
-            seconds = [_clock() - begun]
+            found = run(duration, method, simulate, limits.seconds, save=times, doubt=False)
+            spent = [_clock() - begun]
     except TooLongError as error:
-        return Measurement(value, "slow", note=str(error))
-    while seconds[0] < _SHORT_RUN_SECONDS and len(seconds) < _SHORT_RUN_TIMINGS:
+        return Measurement(0.0, "slow", note=str(error))
+    while spent[0] < _SHORT_RUN_SECONDS and len(spent) < _SHORT_RUN_TIMINGS:
         begun = _clock()
-        quiet_simulate(*start, duration, method, save=times, doubt=False, **step)
-        seconds.append(_clock() - begun)
+        run(duration, method, save=times, doubt=False)
+        spent.append(_clock() - begun)
     # Its checks integrate again: their time is not the run's.
     report_stage("check")
-    # A run that is judged by its energy alone needs more digits of it than the run has.
-    cell = problem.measured(value, truth, times, cache.oracle if truth is None else dyn, run)
-    cell = replace(cell, seconds=float(np.median(seconds)))
+    cell = problem.measured(0.0, truth, times, judge, found)
+    cell = replace(cell, seconds=float(np.median(spent)))
     if cell.end == "diverged":
         return cell
-    doubts = (f"{dyn.model.name}: {method}: {one}" for one in run.check().doubts)
-    cell = replace(cell, warnings=tuple(dict.fromkeys([*heard, *doubts])))
-    return replace(cell, error=cell.energy) if cache.case.measure == "energy" else cell
+    doubts = (f"{dyn.model.name}: {method}: {one}" for one in found.check().doubts)
+    return replace(cell, warnings=tuple(dict.fromkeys([*heard, *doubts])))
 
 
-def _evaluate(cache: _ValueCache, term: str, dyn: Dynamics, truth: Terms) -> Measurement:
+def _evaluate(problem: Problem, term: str, dyn: Dynamics, truth: Terms) -> Measurement:
     """Return the error of a term over all states, and the time of one evaluation."""
     report_stage("method")
     quantity, known = TERMS[term], truth.values[term]
@@ -320,7 +315,7 @@ def _evaluate(cache: _ValueCache, term: str, dyn: Dynamics, truth: Terms) -> Mea
         computed = quantity.call(dyn, truth.at)
     report_stage("run")
     ns, _ = interleaved({"": quantity.single(dyn, truth.at)}, rounds=3)[""]
-    cell = Measurement(cache.value, "finished", seconds=1e-9 * ns, warnings=tuple(heard))
+    cell = Measurement(0.0, "finished", seconds=1e-9 * ns, warnings=tuple(heard))
     if not np.isfinite(computed).all():
         return replace(cell, end="nan", note="numbers that are not finite, and nothing was said")
     if isinstance(known, str):
@@ -331,4 +326,4 @@ def _evaluate(cache: _ValueCache, term: str, dyn: Dynamics, truth: Terms) -> Mea
     with np.errstate(all="ignore"):
         error, high = (np.ldexp(x, exponent) for x in ((computed - known[0]) - known[1], known[0]))
         worst = min(float(quantity.errors(error, high, truth.scales).relative.max()), MAX_ERROR)
-    return replace(cell, error=worst / cache.problem.scale if accelerations else worst)
+    return replace(cell, error=worst / problem.scale if accelerations else worst)
