@@ -10,6 +10,7 @@ from typing import Any, Final
 import mpmath as mp
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legroots
+from numpy.typing import ArrayLike
 from scipy.interpolate import BarycentricInterpolator
 from scipy.spatial.transform import Rotation
 from scipy.special import ellipj, ellipkinc, ellipkm1, elliprf, elliprj
@@ -148,29 +149,16 @@ class HangingChain:
 _DIGITS: Final = 50
 
 
-def released(square: float, rate: float) -> Exact:
-    """Return q of q̈ + 2 a q̇ + ω² q = 0, let go at rest from 1, from ω² and a (Landau, Lifshitz 1976, §25)."""
-    discriminant = square - rate * rate
-    if discriminant > 0:
-        w = np.sqrt(discriminant)
-        return lambda t: (np.exp(-rate * t) * (np.cos(w * t) + rate / w * np.sin(w * t)))[:, None]
-    if discriminant == 0:
-        return lambda t: ((1 + rate * t) * np.exp(-rate * t))[:, None]
-    fast = -(rate + np.sqrt(-discriminant))
-    # The other root by the product of the two: a difference would cancel.
-    slow = square / fast
-    return lambda t: ((fast * np.exp(slow * t) - slow * np.exp(fast * t)) / (fast - slow))[:, None]
+def linear(rates: ArrayLike, start: ArrayLike) -> Exact:
+    """Return the first half of x of ẋ = A x, by exp(A t) with 50 digits."""
+    A, x = np.asarray(rates, dtype=np.float64), np.asarray(start, dtype=np.float64)
 
+    def motion(t: Array) -> Array:
+        with mp.workdps(_DIGITS):
+            states = [mp.expm(mp.matrix(A.tolist()) * mp.mpf(time)) * mp.matrix(x.tolist()) for time in t.tolist()]
+            return np.array([[float(y) for y in state[: len(x) // 2, 0]] for state in states])
 
-def modal(rates: Array, start: Array) -> Exact:
-    """Return the first half of x of ẋ = A x, by 50-digit eigenvalues of A, no two the same."""
-    n = len(start)
-    with mp.workdps(_DIGITS):
-        values, vectors = mp.eig(mp.matrix(rates.tolist()))
-        weights = mp.lu_solve(vectors, mp.matrix(start.tolist()))
-        exponents = np.array([complex(x) for x in values])
-        shapes = np.array([[complex(vectors[i, k] * weights[k]) for k in range(n)] for i in range(n // 2)])
-    return lambda t: np.real(np.exp(np.multiply.outer(t, exponents)) @ shapes.T)
+    return motion
 
 
 def slowest_mode(M: Array, stiffness: Array) -> tuple[float, Array, float]:
@@ -210,39 +198,51 @@ def pendulum(theta: float, speed: float, square: float) -> Exact:
     return lambda t: 2 * ellipj(rate * t + start, m)[3][:, None]
 
 
+class _Phase:
+    """A phase y from 0 to `last` whose time is ∫ slope dy, by Gauss-Legendre; inverted by a table and Newton steps."""
+
+    def __init__(self, slope: Exact, last: float) -> None:
+        self._slope, self._last = slope, last
+        self.whole = float(self.integral(slope, np.array([last]))[0])
+
+    @staticmethod
+    def integral(of: Exact, y: Array) -> Array:
+        """Return ∫ of dy from 0."""
+        nodes, weights = leggauss(_QUADRATURE_NODES)
+        return np.asarray(y / 2 * (of(y[:, None] / 2 * (1 + nodes)) @ weights))
+
+    def at(self, t: Array) -> Array:
+        """Return the phase at times from 0 to the whole one."""
+        table = np.linspace(0, self._last, _TABLE_ROWS)
+        y = np.interp(t, self.integral(self._slope, table), table)
+        for _ in range(4):
+            y = np.clip(y + (t - self.integral(self._slope, y)) / self._slope(y), 0, self._last)
+        return y
+
+
 def cart_pole(theta: float, cart: float) -> Exact:
     """Return (x, θ), (K, 2), of a cart of M kg with a pole of 1 kg and 1 m, let go at rest at x = 0, 0 < θ₀ < π.
 
     No force acts along x, so x = (sin θ₀ - sin θ)/(M + 1), and energy gives
     θ̇² = 2 g (M + 1)(cos θ - cos θ₀)/(M + sin² θ). With sin(θ/2) = k sin φ, k = sin(θ₀/2), φ grows for ever, and
-    dt = √(M/(1 - k² sin² φ) + 4 k² sin² φ) dφ/√(g (M + 1)): a quadrature, by Gauss-Legendre in y, φ = ε sinh y, for
-    the root bends within ε = √M/(2 k) of φ = 0. Inverted by a table and Newton's method.
+    dt = √(M/(1 - k² sin² φ) + 4 k² sin² φ) dφ/√(g (M + 1)): a quadrature in y, φ = ε sinh y, for the root bends within
+    ε = √M/(2 k) of φ = 0.
     """
     k = math.sin(theta / 2)
     bend = math.sqrt(cart) / (2 * k)
-    nodes, weights = leggauss(_QUADRATURE_NODES)
-    last = math.asinh(math.pi / 2 / bend)
 
     def slope(y: Array) -> Array:
         s2 = np.sin(bend * np.sinh(y)) ** 2
         root = np.sqrt(cart / (1 - k * k * s2) + 4 * k * k * s2)
         return np.asarray(root * bend * np.cosh(y) / math.sqrt(_GRAVITY * (cart + 1)))
 
-    def spent(y: Array) -> Array:
-        return y / 2 * (slope(y[:, None] / 2 * (1 + nodes)) @ weights)
-
-    quarter = float(spent(np.array([last]))[0])
+    quarter = _Phase(slope, math.asinh(math.pi / 2 / bend))
 
     def motion(t: Array) -> Array:
         # φ = π/2 at the start; the time is folded onto the quarter period in which φ runs from 0 to π/2.
-        quarters = t / quarter + 1
-        turns = np.rint(quarters / 2)
-        rest = t - (2 * turns - 1) * quarter
-        table = np.linspace(0, last, _TABLE_ROWS)
-        y = np.interp(np.abs(rest), spent(table), table)
-        for _ in range(4):
-            y = np.clip(y + (np.abs(rest) - spent(y)) / slope(y), 0, last)
-        phi = np.sign(rest) * bend * np.sinh(y) + math.pi * turns
+        turns = np.rint((t / quarter.whole + 1) / 2)
+        rest = t - (2 * turns - 1) * quarter.whole
+        phi = np.sign(rest) * bend * np.sinh(quarter.at(np.abs(rest))) + math.pi * turns
         angle = 2 * np.arcsin(k * np.sin(phi))
         return np.stack([(math.sin(theta) - np.sin(angle)) / (cart + 1), angle], axis=-1)
 
@@ -364,16 +364,14 @@ def past_gimbal_lock(distance: float, speed: float) -> tuple[Exact, Array]:
 
 # The exact motion of a mass on a spring, without gravity: Kepler's problem with another force.
 
-_FOURIER_POINTS: Final = 256
-
 
 def ringing_spring(square: float, radius: float, push: float, turn: float) -> tuple[Exact, float]:
     """Return (θ, r - 1), (K, 2), of a mass on a spring of length 1 at rest that turns and rings, and its period.
 
     Energy and angular momentum L give r² ṙ² = -ω² (r - r₁)(r - r₂)(r² + p r + s) with the turning points r₁, r₂ as
     roots. With r = a - b cos φ between them, dt = r dφ/(ω √(r² + p r + s)) and dθ = L dt/r² (Landau, Lifshitz 1976,
-    §14), both even and periodic in φ: sums of a Fourier series' integrals. `square` is ω² = stiffness/mass, 1/s²;
-    `radius`, `push` and `turn` are r, ṙ > 0 and θ̇ at the start, m, m/s and rad/s.
+    §14), both even in φ and with the period 2 π. `square` is ω² = stiffness/mass, 1/s²; `radius`, `push` and `turn` are
+    r, ṙ > 0 and θ̇ at the start, m, m/s and rad/s.
     """
     momentum = radius**2 * turn
     energy = (push**2 + momentum**2 / radius**2 + square * (radius - 1) ** 2) / 2
@@ -381,33 +379,30 @@ def ringing_spring(square: float, radius: float, push: float, turn: float) -> tu
     r2 = _turning_point(1 + math.sqrt(2 * energy / square), square, energy, momentum)
     p, s = r1 + r2 - 2, momentum**2 / (square * r1 * r2)
     a, b = (r1 + r2) / 2, (r2 - r1) / 2
-    grid = a - b * np.cos(2 * math.pi * np.arange(_FOURIER_POINTS) / _FOURIER_POINTS)
-    rate = grid / np.sqrt(square * (grid * (grid + p) + s))
-    order = np.arange(1, _FOURIER_POINTS // 2)
 
-    def integral(values: Array) -> tuple[float, Array]:
-        terms = np.fft.rfft(values).real / _FOURIER_POINTS
-        return float(terms[0]), 2 * terms[1:-1] / order
+    def slope(phi: Array) -> Array:
+        r = a - b * np.cos(phi)
+        return np.asarray(r / np.sqrt(square * (r * (r + p) + s)))
 
-    (mean, waves), (mean_turn, waves_turn) = integral(rate), integral(momentum * rate / grid**2)
+    def turning(phi: Array) -> Array:
+        return momentum * slope(phi) / (a - b * np.cos(phi)) ** 2
+
+    half = _Phase(slope, math.pi)
     # sin φ from the push and cos φ from the place: either alone is blind somewhere.
     pace = push * radius / math.sqrt(square * (radius * (radius + p) + s))
-    first = math.atan2(pace, a - radius)
-
-    def since_start(phi: Array, line: float, terms: Array) -> Array:
-        values, at_start = (line * x + np.sin(np.multiply.outer(x, order)) @ terms for x in (phi, np.array([first])))
-        return np.asarray(values - at_start)
+    first = np.array([math.atan2(pace, a - radius)])
+    (begun,), (before,) = half.integral(slope, first), half.integral(turning, first)
+    (half_turn,) = half.integral(turning, np.array([math.pi]))
 
     def motion(t: Array) -> Array:
-        phi = first + t / mean
-        for _ in range(20):
-            r = a - b * np.cos(phi)
-            slope = r / np.sqrt(square * (r * (r + p) + s))
-            phi = phi - (since_start(phi, mean, waves) - t) / slope
-        theta = since_start(phi, mean_turn, waves_turn)
+        # Folded onto half a period, in which φ runs from 0 to π.
+        rounds = np.rint((t + begun) / (2 * half.whole))
+        rest = t - 2 * rounds * half.whole + begun
+        phi = half.at(np.abs(rest))
+        theta = 2 * rounds * half_turn + np.sign(rest) * half.integral(turning, phi) - before
         return np.stack([theta, a - 1 - b * np.cos(phi)], axis=-1)
 
-    return motion, 2 * math.pi * mean
+    return motion, 2 * half.whole
 
 
 def _turning_point(bound: float, square: float, energy: float, momentum: float) -> float:

@@ -207,7 +207,7 @@ def _problem(case: Case, value: float) -> Problem:
 
 
 def _oracle(case: Case, value: float) -> OracleDynamics:
-    return _cached(case, value, "oracle", partial(OracleDynamics, _problem(case, value).model))
+    return _cached(case, value, "34 digits", partial(OracleDynamics, _problem(case, value).model))
 
 
 def _engine(model: Model, engine: str) -> tuple[Dynamics, list[str]]:

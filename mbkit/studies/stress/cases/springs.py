@@ -13,6 +13,7 @@ import numpy as np
 from mbkit import catalog
 from mbkit._check import EPS, Array
 from mbkit.model import Model, ModelBuilder
+from mbkit.model.validation import sample_mass_matrix
 from mbkit.studies.measurement import Problem
 from mbkit.studies.motions import exact as exact_motions
 from mbkit.studies.stress.cases._common import SWING, Facts, Make, case, motion, powers
@@ -49,7 +50,7 @@ def _released_hinge(
     b = ModelBuilder("hinge", gravity=(0.0, 0.0, 0.0))
     b.add_body("bob", mass=1.0, com=(0.0, 0.0, -1.0))
     b.add_joint("theta", "continuous", parent="world", child="bob", axis=SWING, stiffness=stiffness, damping=damping)
-    exact, source = exact_motions.released(stiffness, damping / 2), "damped oscillator, Landau, Lifshitz 1976, §25"
+    exact, source = exact_motions.linear([[0.0, 1.0], [-stiffness, -damping]], [1, 0]), "linear motion with 50 digits"
     return motion(b.build(), np.ones(1), 0.0, duration, exact, floor, source, facts=facts, **more)
 
 
@@ -191,8 +192,8 @@ def stiff_damping(damping: float) -> Problem:
     b.add_joint("x2", "prismatic", parent="first", child="second", axis=along, damping=damping)
     # q̈ = -M⁻¹ (K q + C q̇), M = [[2, 1], [1, 1]].
     rates = np.array([[0, 0, 1, 0], [0, 0, 0, 1], [-4, 0, 0, damping], [4, 0, 0, -2 * damping]])
-    exact, facts = exact_motions.modal(rates, np.array([1.0, 0.0, 0.0, 0.0])), _facts(2 * damping, 2.0, damped=True)
-    return motion(b.build(), [1.0, 0.0], 0.0, 2.0, exact, 16 * EPS, "linear modes with 50 digits", facts=facts)
+    exact, facts = exact_motions.linear(rates, [1, 0, 0, 0]), _facts(2 * damping, 2.0, damped=True)
+    return motion(b.build(), [1.0, 0.0], 0.0, 2.0, exact, 16 * EPS, "linear motion with 50 digits", facts=facts)
 
 
 @case("stiffness", "cart mass", "kg", powers(0, -12, 2), (1.0, 1e-4, 1e-8, 1e-12))
@@ -215,32 +216,19 @@ def flexible_appendage(stiffness: float) -> Problem:
     model = catalog.flexible_spacecraft(segments=4, bending_stiffness=stiffness)
     hub = replace(model.joints[0], stiffness=np.array([0.0, 0.0, soft]))
     springs = np.array([soft, *(2 * j.stiffness[0] for j in model.joints[1:5])])
-    frequency, shape, fastest = exact_motions.slowest_mode(_antisymmetric_inertia(model), springs)
+    # The hub's turn, and the bends of one beam, which the other one repeats, about the straight shape.
+    free = np.vstack([np.zeros((2, 5)), np.eye(5), np.eye(5)[1:]])
+    M = free.T @ sample_mass_matrix(model, model.neutral()) @ free
+    frequency, shape, fastest = exact_motions.slowest_mode(M, springs)
 
     def exact(t: Array) -> Array:
-        bent = np.multiply.outer(np.cos(frequency * t), angle * shape)
-        return np.concatenate([np.zeros((len(t), 2)), bent, bent[:, 1:]], axis=1)
+        return np.multiply.outer(np.cos(frequency * t), angle * (free @ shape))
 
     # Terms beyond the linear ones bend the beams by the square of the angle, relative to the motion.
     floor = angle**3 * float(np.abs(shape[1:]).sum()) ** 2 + 16 * EPS
     facts = _facts(fastest, duration) | {"slowest frequency, rad/s": frequency}
     model, start = replace(model, joints=(hub, *model.joints[1:])), exact(np.zeros(1))[0]
     return motion(model, start, 0.0, duration, exact, floor, "slowest linear mode", facts=facts, scale=angle)
-
-
-def _antisymmetric_inertia(model: Model) -> Array:
-    """Return M of the hub's turn and the bends of one beam, which the other one repeats, about the straight shape."""
-    hub, *segments = model.bodies[:5]
-    n = len(segments)
-    M = np.zeros((n + 1, n + 1))
-    M[0, 0] = hub.inertia[2, 2]
-    # Distance of each joint, the hub's centre first, and of each segment's centre from the hub's.
-    pivots = np.concatenate([[0.0], np.cumsum([j.translation[0] for j in model.joints[1 : n + 1]])])
-    for i, body in enumerate(segments, start=1):
-        turns = (np.arange(n + 1) <= i).astype(float)
-        moves = turns * (pivots[i] + body.com[0] - pivots)
-        M += 2 * (body.mass * np.outer(moves, moves) + body.inertia[2, 2] * np.outer(turns, turns))
-    return M
 
 
 # The step at which linear theory lets a method break on q̈ + 2 ζ ω q̇ + ω² q = 0.
