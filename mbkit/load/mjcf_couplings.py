@@ -20,7 +20,7 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import MAX_MAGNITUDE, Array
 from mbkit.load.mjcf_reader import MjcfJoint, Scene
-from mbkit.load.xml_reader import Element, Reader, reserved
+from mbkit.load.xml_reader import Element, element_text, reserved
 from mbkit.model import GravityCompensation, Joint, JointCoupling, Model, ModelBuilder, PointSpring
 from mbkit.model.description import LEFT_OUT, SERVOS
 from mbkit.model.elements.forces import RATE
@@ -45,73 +45,45 @@ _NONE: Final[_Numbers] = (0.0, 0.0, 0.0)
 _Points = tuple[tuple[str, Array], ...]
 #: Parts that equality constraints bind.
 _ENDS: Final = ("joint", "body", "tendon", "site", "flex")
-#: Attributes that every actuator inherits from its default classes: most and fewest numbers, and their default.
-_INHERITED: Final[Mapping[str, tuple[int, int, tuple[float, ...]]]] = {
-    "gear": (6, 1, (1.0,)),
-    "armature": (1, 1, (0.0,)),
-    "damping": (3, 1, (0.0,)),
-    "group": (1, 1, (0.0,)),
-    "forcerange": (2, 2, ()),
-    "ctrlrange": (2, 2, ()),
-    "posrange": (2, 2, ()),
-}
+#: Attributes that name something.
+_NAMES: Final = frozenset({"name", "class", "joint", "jointinparent", "tendon", "body", "site", "refsite"})
 
 
 @dataclass(frozen=True)
 class _Actuator:
-    """An actuator's settings, with those of its default classes, as in MuJoCo's `mjsActuator`.
+    """An actuator's settings, with those of its default classes, as MuJoCo's parser has them in its `mjsActuator`."""
 
-    Gain, bias and their types come from a <general> or an element of the same tag only, those of <pid> from a <pid>
-    only. `tag` is that of the last element of a class, and `parent` the class that it inherits.
-    """
+    gaintype: str
+    biastype: str
+    gain: float
+    bias: _Numbers
+    gear: float
+    damping: _Numbers
+    armature: float
+    group: float
+    #: By attribute; 0 0 where there is none.
+    ranges: Mapping[str, _Numbers]
 
-    tag: str = "general"
-    parent: _Actuator | None = None
-    gain: float = 1.0
-    bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    gaintype: str = "fixed"
-    biastype: str = "none"
-    forcelimited: str = "auto"
-    numbers: Mapping[str, tuple[float, ...]] = field(default_factory=lambda: {n: x[2] for n, x in _INHERITED.items()})
+    @classmethod
+    def of(cls, text: str, tag: str) -> _Actuator:
+        """Return the only actuator of an MJCF; ValueError where MuJoCo's parser refuses it."""
+        # Imported late: few files have actuators.
+        import mujoco
 
-    def with_element(self, element: Element, item: str, read: Reader) -> _Actuator:
-        """Return these settings, changed by an element's attributes."""
-        own, tag = element.attributes, element.tag
-
-        def number(name: str, default: float) -> float:
-            return read.number(element, name, item, default)
-
-        base = self
-        while tag != "general" and base.tag not in (("pid",) if tag == "pid" else (tag, "general")):
-            base = base.parent or _Actuator(tag=tag)
-        gain, (b0, b1, b2), gaintype, biastype = base.gain, base.bias, base.gaintype, base.biastype
-        if tag == "general":
-            gain = read.numbers(element, "gainprm", item, count=10, least=1, default=(gain,))[0]
-            bias = read.numbers(element, "biasprm", item, count=10, least=1, default=base.bias)[:3]
-            b0, b1, b2 = (*bias, *base.bias[len(bias) :])
-            gaintype, biastype = own.get("gaintype", gaintype), own.get("biastype", biastype)
-        elif tag in ("position", "intvelocity", "pid"):
-            gain = number("kp", gain)
-            # MuJoCo keeps a damping ratio as a positive b2.
-            b0, b1, b2 = 0.0, -gain, number("dampratio", -number("kv", -b2))
-            gaintype, biastype = "pid" if tag == "pid" else "fixed", "affine"
-        elif tag == "velocity":
-            gain = number("kv", gain)
-            b0, b1, b2, gaintype, biastype = 0.0, 0.0, -gain, "fixed", "affine"
-        elif tag == "cylinder":
-            b0, b1, b2 = read.numbers(element, "bias", item, count=3, default=base.bias)
-            gain, biastype = number("area", gain), "affine"
-        elif tag in ("motor", "damper", "adhesion"):
-            gain, b0, b1, b2 = number("gain", 1.0), 0.0, 0.0, 0.0
-            gaintype, biastype = "affine" if tag == "damper" else "fixed", "none"
-        else:
-            gaintype = biastype = tag
-        numbers = {
-            name: read.numbers(element, name, item, count=most, least=least, default=self.numbers[name])
-            for name, (most, least, _) in _INHERITED.items()
-        }
-        forcelimited = own.get("forcelimited", self.forcelimited)
-        return _Actuator(tag, self.parent, gain, (b0, b1, b2), gaintype, biastype, forcelimited, numbers)
+        own = mujoco.MjSpec.from_string(text).actuators[0]
+        gaintype, biastype = (x.name.partition("_")[2].lower() for x in (own.gaintype, own.biastype))
+        b0, b1, b2 = own.biasprm[:3].tolist()
+        ranges = {("posrange" if tag == "pid" else "ctrlrange"): tuple(own.ctrlrange.tolist())}
+        if own.forcelimited != mujoco.mjtLimited.mjLIMITED_FALSE:
+            ranges["forcerange"] = tuple(own.forcerange.tolist())
+        gain = -b1 if gaintype == "pid" else float(own.gainprm[0])
+        numbers = float(own.gear[0]), tuple(own.damping.tolist()), float(own.armature), float(own.group)
+        if not np.isfinite(
+            [gain, b0, b1, b2, numbers[0], *numbers[1], *numbers[2:], *np.ravel([*ranges.values()])]
+        ).all():
+            raise ValueError("numbers that are not finite")
+        types = ("plugin", "plugin") if tag == "plugin" else (gaintype, biastype)
+        return cls(*types, gain, (b0, b1, b2), *numbers, ranges)
 
 
 @dataclass(frozen=True)
@@ -210,14 +182,12 @@ class Transmissions:
         self._scene, self._read, self._disabled, self._servos = scene, scene.read, disabled, servos
         self._joints: dict[str, MjcfJoint] = {j.name: j for body in scene.bodies for j in body.joints}
         self._names: set[str] = set()
+        self._defaults = "".join(map(_defaults, mujoco.all("default")))
         self._groups: set[float] = set()
         for option in mujoco.all("option"):
             self._groups |= {
                 *self._read.numbers(option, "actuatorgroupdisable", "the file", count=31, least=0, default=())
             }
-        self._classes = {"main": _Actuator()}
-        for element in mujoco.all("default"):
-            self._collect(element, "main")
         self._sites = {site: ("world", X.p) for site, X in scene.sites}
         self._sites |= {site: (body.name, X.p - body.anchor) for body in scene.bodies for site, X in body.sites}
 
@@ -231,16 +201,6 @@ class Transmissions:
         #: dl/dq by joint of each tendon; nothing where its length is no sum of coordinates.
         self.factors = {name: t.factors for name, t in self._known.items()}
         self._actuators = [self._actuator(e, label, k) for k, (e, label) in enumerate(inside("actuator"), 1)]
-
-    def _collect(self, element: Element, name: str) -> None:
-        """Read the actuator defaults of a class and of the classes in it."""
-        for child in element.children:
-            if child.tag in _ACTUATORS:
-                self._classes[name] = self._classes[name].with_element(child, f"default class {name!r}", self._read)
-        for child in element.all("default"):
-            inner = child.attributes.get("class", "")
-            self._classes[inner] = replace(self._classes[name], parent=self._classes[name])
-            self._collect(child, inner)
 
     def _acting(self, element: Element, label: str, kind: str, number: int) -> Acting:
         return Acting(label, reserved(element.attributes.get("name") or f"{kind}{number}", self._names))
@@ -309,11 +269,10 @@ class Transmissions:
 
     def _actuator(self, element: Element, label: str, number: int) -> Acting:
         item = f"actuator {label}"
-        class_ = self._scene.defaults.known(element.attributes.get("class"), element) or "main"
-        settings = self._classes.get(class_, _Actuator()).with_element(element, item, self._read)
         out = self._acting(element, label, "actuator", number)
-        (out.armature,), (group,) = settings.numbers["armature"], settings.numbers["group"]
-        gear, (c0, c1, c2) = settings.numbers["gear"][0], (*settings.numbers["damping"], *_NONE)[:3]
+        if (settings := self._settings(element, item)) is None:
+            return out
+        out.armature, gear, (c0, c1, c2) = settings.armature, settings.gear, settings.damping
         driven = self._driven(element, item)
         out.factors = {joint: gear * c for joint, c in driven.factors.items() if gear * c}
         out.path = tuple((gear * factor, points) for factor, points in driven.path if gear * factor)
@@ -321,10 +280,10 @@ class Transmissions:
         out.armature *= bool(gear)
         self._hold(out, element, item, (c0, c1 / abs(gear), c2 / gear**2) if gear else _NONE, _NONE, 0.0, 0.0)
         gain = f"gain {settings.gain:g}" if settings.gaintype == "fixed" else f"{settings.gaintype} gain"
-        limits = "".join(f" {x:g}" for x in settings.numbers["ctrlrange"])
+        limits = "".join(f" {x:g}" for x in settings.ranges.get("ctrlrange", ()) if any(settings.ranges["ctrlrange"]))
         at = out.coupling().length if out.factors else element.attributes.get("tendon", "no sum of coordinates")
         out.control = f"{label} ({element.tag}, {gain}{f', range{limits}' if limits else ''}) on {at}"
-        if "actuation" not in self._disabled and group not in self._groups:
+        if "actuation" not in self._disabled and settings.group not in self._groups:
             servo = Acting(out.item, out.name, out.factors)
             _add_bias(settings, servo)
             servo.linear()
@@ -336,6 +295,21 @@ class Transmissions:
                     setattr(out, name, getattr(out, name) + getattr(servo, name))
                 out.left_out += servo.left_out
         return out
+
+    def _settings(self, element: Element, item: str) -> _Actuator | None:
+        """Return an actuator's settings, or keep a fault."""
+        name = self._scene.defaults.known(element.attributes.get("class"), element)
+        own = {k: x for k, x in element.attributes.items() if k != "class"} | ({"class": name} if name else {})
+        numbers = [word for k, x in own.items() if k not in _NAMES for word in x.lower().split()]
+        try:
+            # MuJoCo takes them, with a warning in a file.
+            if not {"nan", "inf"}.isdisjoint(word.lstrip("+-") for word in numbers):
+                raise ValueError("numbers that are not finite")
+            one = element_text(element.tag, own)
+            return _Actuator.of(f"<mujoco>{self._defaults}<actuator>{one}</actuator></mujoco>", element.tag)
+        except ValueError as error:
+            self._read.fault(f"{item}: MuJoCo's parser refuses: {' '.join(str(error).split())}", element)
+            return None
 
     def _driven(self, element: Element, item: str) -> Acting:
         """Return what has the length before the gear."""
@@ -509,12 +483,10 @@ def with_parts(model: Model, parts: Sequence[PointSpring | JointCoupling | Gravi
 
 def _add_bias(settings: _Actuator, out: Acting) -> None:
     """Add an actuator's force at zero control and activation."""
-    for what, (low, high) in (
-        (what, settings.numbers[f"{what}range"] or (0.0, 0.0)) for what in ("ctrl", "pos", "force")
-    ):
-        acts = low > 0 or high < 0 or (what == "force" and settings.biastype != "none" and any(settings.bias))
-        if acts and high > low and (what != "force" or settings.forcelimited != "false"):
-            out.left_out.append(f"{what}range {low:g} {high:g}")
+    for what, (low, high) in settings.ranges.items():
+        acts = low > 0 or high < 0 or (what == "forcerange" and settings.biastype != "none" and any(settings.bias))
+        if acts and high > low:
+            out.left_out.append(f"{what} {low:g} {high:g}")
     if settings.biastype == "none":
         return
     if settings.biastype != "affine":
@@ -532,6 +504,16 @@ def _add_bias(settings: _Actuator, out: Acting) -> None:
         out.damping -= b2
     else:
         out.left_out.append(f"the force {b2:g} times the rate")
+
+
+def _defaults(element: Element) -> str:
+    """Return the default classes of actuators as text."""
+    inside = (
+        _defaults(e) if e.tag == "default" else element_text(e.tag, e.attributes)
+        for e in element.children
+        if e.tag in ("default", *_ACTUATORS)
+    )
+    return element_text("default", element.attributes, "".join(inside))
 
 
 def bound_parts(element: Element) -> str:
