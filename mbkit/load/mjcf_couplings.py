@@ -71,19 +71,18 @@ class _Actuator:
         import mujoco
 
         own = mujoco.MjSpec.from_string(text).actuators[0]
-        gaintype, biastype = (x.name.partition("_")[2].lower() for x in (own.gaintype, own.biastype))
-        b0, b1, b2 = own.biasprm[:3].tolist()
-        ranges = {("posrange" if tag == "pid" else "ctrlrange"): tuple(own.ctrlrange.tolist())}
-        if own.forcelimited != mujoco.mjtLimited.mjLIMITED_FALSE:
-            ranges["forcerange"] = tuple(own.forcerange.tolist())
-        gain = -b1 if gaintype == "pid" else float(own.gainprm[0])
-        numbers = float(own.gear[0]), tuple(own.damping.tolist()), float(own.armature), float(own.group)
-        if not np.isfinite(
-            [gain, b0, b1, b2, numbers[0], *numbers[1], *numbers[2:], *np.ravel([*ranges.values()])]
-        ).all():
+        numbers = own.biasprm[:3], own.damping, own.ctrlrange, own.forcerange, own.gainprm[:1], own.gear[:1]
+        if not np.isfinite([*np.concatenate(numbers), own.armature]).all():
             raise ValueError("numbers that are not finite")
-        types = ("plugin", "plugin") if tag == "plugin" else (gaintype, biastype)
-        return cls(*types, gain, (b0, b1, b2), *numbers, ranges)
+        bias, damping, control, force, (gain,), (gear,) = (tuple(x.tolist()) for x in numbers)
+        gaintype, biastype = (x.name.partition("_")[2].lower() for x in (own.gaintype, own.biastype))
+        if tag == "plugin":
+            gaintype = biastype = tag
+        ranges = {"posrange" if tag == "pid" else "ctrlrange": control}
+        if own.forcelimited != mujoco.mjtLimited.mjLIMITED_FALSE:
+            ranges["forcerange"] = force
+        gain = -bias[1] if gaintype == "pid" else gain
+        return cls(gaintype, biastype, gain, bias, gear, damping, own.armature, own.group, ranges)
 
 
 @dataclass(frozen=True)
