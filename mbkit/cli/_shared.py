@@ -106,18 +106,9 @@ def load_options(command: Command) -> Command:
     """Add the options for reading a file or robot; the command gets those that were set as `options`."""
 
     @functools.wraps(command)
-    def with_options(
-        *args: Any,
-        floating_base: bool,
-        actuators: bool,
-        mimic: str | None,
-        nonphysical: str | None,
-        loops: str | None,
-        **more: Any,
-    ) -> None:
-        options = {"floating_base": floating_base or None, "mimic": mimic, "nonphysical": nonphysical, "loops": loops}
-        options["actuators"] = actuators or None
-        command(*args, options={k: v for k, v in options.items() if v is not None}, **more)
+    def with_options(*args: Any, **more: Any) -> None:
+        given = {name: more.pop(name) for name in ("floating_base", "mimic", "nonphysical", "loops", "actuators")}
+        command(*args, options={k: v for k, v in given.items() if v not in (None, False)}, **more)
 
     bodies, mimics = click.Choice(["error", "warn"]), click.Choice(["reduce", "free"])
     base = click.option("--floating-base", is_flag=True, help="Let the base of a file or robot move freely.")

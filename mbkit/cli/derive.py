@@ -81,7 +81,7 @@ def derive(
     from mbkit.lagrangian.energies.charts import chart_names
     from mbkit.lagrangian.energy_model import EnergyModel
     from mbkit.lagrangian.from_description import from_model
-    from mbkit.lagrangian.printing.catalog_symbols import in_symbols, letters, with_plain_turns
+    from mbkit.lagrangian.printing.catalog_symbols import in_symbols, letters
     from mbkit.model.changes.dry_friction import held_at_rest
     from mbkit.simulate.progress import Bar
 
@@ -96,9 +96,7 @@ def derive(
         _tell_functions(*_write_c(model, system, out or Path(_C_FOLDER), force))
         return
     if form != "python" and not on_paper:
-        target, note = with_plain_turns(target, snap)
-        if note:
-            say("note", f"{note}. The equations to read differ from the model by that; --snap 0 leaves it as it is")
+        target = _to_read(target, snap, "equations")
     with Bar(f"derive {target.name}") as bar:
         names = None if on_paper else letters(target)
         lag = from_model(target, coordinates=names, progress=lambda x, text: bar(0.1 * x, text))
@@ -153,15 +151,22 @@ def _about(system: Callable[..., Lagrangian]) -> str:
     return ". ".join([first.replace("Return ", f"{system.__name__}: ", 1), *rest])
 
 
+def _to_read(model: Model, snap: float, what: str) -> Model:
+    """Return a model whose rotations near to plain ones are plain, and say so."""
+    from mbkit.lagrangian.printing.catalog_symbols import with_plain_turns
+
+    model, note = with_plain_turns(model, snap)
+    if note:
+        say("note", f"{note}. The {what} to read differ from the model by that; --snap 0 leaves it as it is")
+    return model
+
+
 def _program(model: Model, quantity: str, form: str | None, snap: float) -> tuple[str, str]:
     """Return one quantity as named terms, and the ending of its file."""
-    from mbkit.lagrangian.printing.catalog_symbols import with_plain_turns
     from mbkit.lagrangian.printing.program_text import ProgramText, program
 
     if form in (None, "latex"):
-        model, note = with_plain_turns(model, snap)
-        if note:
-            say("note", f"{note}. The terms to read differ from the model by that; --snap 0 leaves it as it is")
+        model = _to_read(model, snap, "terms")
     text = program(model, quantity)
     forms: dict[str | None, tuple[Callable[[ProgramText], str], str]] = {
         None: (str, ".txt"),
