@@ -526,7 +526,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
             _GATES[group].admit(self.model, f"{quantity}: not known of")
         method = getattr(self, f"_{quantity}", None)
         if method is None or quantity in self._refuses:
-            reason = self._refuses.get(quantity, f"{type(self).__name__} has no _{quantity}")
+            none = f"{type(self).__name__} has no _{quantity}; mbkit.dynamics(model, 'lagrangian') has"
+            reason = self._refuses.get(quantity, none)
             raise UnsupportedError(f"{self.engine} cannot give {quantity}: {reason}")
         if self.model.forces and not self._has_force_elements:
             return self._elements.beside(quantity, method, self)

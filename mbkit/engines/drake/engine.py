@@ -61,8 +61,6 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
     _takes_wrenches = ("inverse_dynamics", "forward_dynamics")
     _refuses: ClassVar[dict[str, str]] = {
         "coriolis_matrix": "Drake forms C v without the matrix; nle(q, v) - gravity(q) is C v",
-        "function": "it has no CasADi form; mbkit.dynamics(model, 'lagrangian') has",
-        **dict.fromkeys(of_groups("regressor"), "Drake has no regressor; mbkit.dynamics(model, 'lagrangian') has"),
     }
 
     def __init__(self, model: Model) -> None:

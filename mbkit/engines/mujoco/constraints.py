@@ -246,8 +246,8 @@ def _bias(m: Any, d: Any, i: int) -> Array:
     # r is the imaginary part of p = q̄_b q_a, times a scale: ṗ = ½ q̄_b Δω q_a, of quaternions in the world's axes.
     Q = [_quaternion(m, d, s) for s in (m.eq_obj1id[i], m.eq_obj2id[i])]
     wa, wb = (np.append(x[3:], 0.0) for x in (rate_a, rate_b))
-    turning = np.append(a[3:] - b[3:], 0.0) + 0.5 * (_times(wa - wb, wa) - _times(wb, wa - wb))
-    p = 0.5 * _times(spatial.conjugate(Q[1]), _times(turning, Q[0]))
+    turning = np.append(a[3:] - b[3:], 0.0) + 0.5 * (spatial.multiply(wa - wb, wa) - spatial.multiply(wb, wa - wb))
+    p = 0.5 * spatial.multiply(spatial.conjugate(Q[1]), spatial.multiply(turning, Q[0]))
     return np.concatenate([gap, m.eq_data[i, 10] * p[:3]])
 
 
@@ -259,12 +259,7 @@ def _motion(m: Any, d: Any, site: int) -> tuple[Array, Array]:
 
 def _quaternion(m: Any, d: Any, site: int) -> Array:
     """Return a site's quaternion with MuJoCo's sign, which decides that of the rows."""
-    return _times(*(np.roll(x, -1) for x in (d.xquat[m.site_bodyid[site]], m.site_quat[site])))
-
-
-def _times(p: Array, q: Array) -> Array:
-    """Return the product of two quaternions x, y, z, w."""
-    return np.append(p[3] * q[:3] + q[3] * p[:3] + np.cross(p[:3], q[:3]), p[3] * q[3] - p[:3] @ q[:3])
+    return spatial.multiply(*(np.roll(x, -1) for x in (d.xquat[m.site_bodyid[site]], m.site_quat[site])))
 
 
 # The rows of the contract, from the motion of sites

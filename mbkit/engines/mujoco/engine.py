@@ -41,7 +41,6 @@ from mbkit.engines.mujoco.model import (
 from mbkit.engines.mujoco.rollout import rollout
 from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, NumericalError
 from mbkit.model import Model
-from mbkit.model.quantities import of_groups
 
 if TYPE_CHECKING:
     from mbkit.engines.closed_loops.frame_rows import Rows
@@ -92,8 +91,6 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
     )
     _refuses: ClassVar[dict[str, str]] = {
         "coriolis_matrix": "MuJoCo forms C v + g without the matrix; nle(q, v) - gravity(q) is C v",
-        "function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has",
-        **dict.fromkeys(of_groups("regressor"), "MuJoCo has no regressor; mbkit.dynamics(model, 'lagrangian') has"),
         "constraint_rate_gradient": "its derivatives are finite differences; the lagrangian engine has this one",
         "constraint_forces": "its soft constraints have rows of their own; constraint_law(q, v, tau).force is theirs, "
         "and generalized_constraint_force(q, v, tau) is Jᵀ λ",

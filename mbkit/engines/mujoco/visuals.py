@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Any
 
 import mujoco
 
@@ -11,14 +11,6 @@ from mbkit.engines.mujoco.constraints import wxyz
 from mbkit.load.xml_reader import reserved
 from mbkit.model import Model
 from mbkit.show import Shape
-
-_TYPES: Final = {
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-}
 
 
 def add_shapes(spec: Any, bodies: Mapping[str, Any], description: Model, shapes: Sequence[Shape]) -> None:
@@ -36,10 +28,10 @@ def add_shapes(spec: Any, bodies: Mapping[str, Any], description: Model, shapes:
         look: dict[str, Any] = {"pos": shape.translation, "quat": wxyz(shape.rotation), "group": 2}
         look |= {"mass": 0.0, "contype": 0, "conaffinity": 0}
         body = bodies[shape.body]
+        look["type"] = getattr(mujoco.mjtGeom, f"mjGEOM_{shape.kind.upper()}")
         if shape.kind != "mesh":
             size = [*shape.size, 0.0, 0.0][:3]
-            name = reserved(shape.name, names)
-            body.add_geom(name=name, type=_TYPES[shape.kind], size=size, rgba=shape.color, **look)
+            body.add_geom(name=reserved(shape.name, names), size=size, rgba=shape.color, **look)
             continue
         for surface in shape.meshes:
             if id(surface) not in meshes:
@@ -49,5 +41,4 @@ def add_shapes(spec: Any, bodies: Mapping[str, Any], description: Model, shapes:
                 # Surfaces with holes have no volume.
                 mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
             name, rgba = reserved(shape.name, names), surface.color or shape.color
-            mesh_type = mujoco.mjtGeom.mjGEOM_MESH
-            body.add_geom(name=name, type=mesh_type, meshname=meshes[id(surface)], rgba=rgba, **look)
+            body.add_geom(name=name, meshname=meshes[id(surface)], rgba=rgba, **look)

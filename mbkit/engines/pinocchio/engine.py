@@ -136,7 +136,6 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
 
     engine = "pinocchio"
     _refuses: ClassVar[dict[str, str]] = {
-        "function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has",
         "constraint_rate_gradient": "its derivatives are of trees; mbkit.dynamics(model, 'lagrangian') has this one",
     }
     _path = PINOCCHIO
