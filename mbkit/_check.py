@@ -32,6 +32,10 @@ CONSISTENT: Final = 1e-8
 PRINTED: Final = 1e-6
 #: Larger than anything that moves, and the products of several still fit a double.
 MAX_MAGNITUDE: Final = 1e30
+#: Random places, poses or states at which a property of formulas is looked for.
+PROBES: Final = 4
+#: Imaginary step of derivatives that are right to rounding.
+COMPLEX_STEP: Final = 1e-30
 _MAX_SUMMED: Final = 64
 #: Numbers of a piece of an array that is checked and copied in pieces.
 _PIECE_SIZE: Final = 2**16

@@ -16,8 +16,6 @@ from mbkit.model import Model, ModelBuilder, Number
 
 __all__ = ["bricard", "delta_robot", "double_cardan_shaft", "flyball_governor", "stewart_platform"]
 
-#: Cosine and sine of the angle at which a governor's arms start below the level: 30°.
-_ARM_COSINE, _ARM_SINE = 0.75**0.5, 0.5
 #: Half the angle between two feet of a Stewart platform, or two joints, that stand together.
 _HALF_PAIR_ANGLE: Final = pi / 18
 
@@ -109,7 +107,8 @@ def flyball_governor(
         # The ball is at the end of the arm: reduced mass times the square of the distance of the two centres.
         lever = (density * arm / 2 + ball_mass) / mass
         across = arm**2 * (density * arm / 12 + density * arm * ball_mass / mass / 4)
-        out = (side * _ARM_COSINE, -_ARM_SINE)
+        # 30° below the level.
+        out = (side * 0.75**0.5, -0.5)
         inertia = [[across * (float(i == j) - at(out)[i] * at(out)[j]) for j in range(3)] for i in range(3)]
         b.add_body(f"arm{k}", mass=mass, com=at(times(arm * lever, *out)), inertia=inertia)
         add_rod(b, f"link{k}", density * half, at(times(half, -out[0], out[1])))

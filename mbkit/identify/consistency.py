@@ -20,17 +20,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import PRINTED, Array
 from mbkit.errors import NumericalError, UnsupportedError
 from mbkit.identify.measurements import Unknowns
 from mbkit.model.base_parameters import STANDARD, BaseParameters, parameters_of, pseudo_inertia
 
 ENTROPIC, EUCLIDEAN = "entropic", "euclidean"
 PRIORS: Final = (ENTROPIC, EUCLIDEAN)
-#: Least eigenvalue of X, so that written numbers are matter after rounding too.
-_MIN_EIGENVALUE: Final = 1e-6
-#: Least extent of a body, relative to its largest, so that L exists.
-_POINT_EXTENT_RATIO: Final = 1e-6
 _SIZE: Final = len(STANDARD)
 
 
@@ -70,7 +66,8 @@ def consistent(system: Array, unknowns: Unknowns, length: float, prior: str, wei
         total += cp.trace(X) - cp.log_det(X) if prior == ENTROPIC else 0.5 * cp.sum_squares(X - np.eye(4))
     # The solver likes numbers of the order of one.
     objective = (0.5 * cp.sum_squares(predicted - b) + weight * total) / (len(b) + weight)
-    problem = cp.Problem(cp.Minimize(objective), [X >> _MIN_EIGENVALUE * np.eye(4) for X in shapes.values()])
+    # Written numbers are matter after rounding too.
+    problem = cp.Problem(cp.Minimize(objective), [X >> PRINTED * np.eye(4) for X in shapes.values()])
     with warnings.catch_warnings():
         # Its accuracy has fewer digits than it aims at, which data without noise do not allow.
         warnings.filterwarnings("ignore", "Solution may be inaccurate")
@@ -129,5 +126,5 @@ def _root(J: Array, length: float) -> Array:
     """Return L with L Lᵀ = J, of a body without extent with a little of it."""
     lengths = np.array([length, length, length, 1.0])
     values, axes = np.linalg.eigh(J / np.outer(lengths, lengths))
-    values = np.maximum(values, _POINT_EXTENT_RATIO * values.max())
+    values = np.maximum(values, PRINTED * values.max())
     return np.asarray(lengths[:, None] * axes * np.sqrt(values))

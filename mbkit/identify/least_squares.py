@@ -22,8 +22,6 @@ from mbkit.model.base_parameters import eliminated
 #: geometry that counts as parallel is 1e-7 for base parameters; noise would be blown up as much.
 SINGULAR_VALUE_RATIO: Final = 1e-8
 _MAX_REWEIGHTINGS: Final = 10
-#: Least noise, relative to the largest noise or torque; a torque may be exact, or always zero.
-MIN_NOISE_RATIO: Final = 1e-6
 #: Change of variances between two rounds at which they are taken as settled.
 _VARIANCE_CHANGE: Final = 1e-3
 
@@ -92,7 +90,7 @@ def stacked(equations: Sequence[Equations], noise: Array) -> Array:
 def _weighing(noise: Array, equations: Sequence[Equations]) -> Array:
     """Return the noise that weighs: no less than rounding, nor so small that the other equations would not count."""
     rounding = EPS * (max((x.size for x in equations), default=0.0) or 1.0)
-    return np.maximum(noise, max(rounding, MIN_NOISE_RATIO * float(noise.max(initial=0.0))))
+    return np.maximum(noise, max(rounding, PRINTED * float(noise.max(initial=0.0))))
 
 
 class _Solution:

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbkit._check import Array, finite_array
+from mbkit._check import PROBES, Array, finite_array
 from mbkit.engines.base import Dynamics
 from mbkit.errors import InputError
 from mbkit.model import Model
@@ -29,8 +29,6 @@ _KNOWN: Final = {"T", "V", "loss", "jump", "force"}
 REST_SPEED_RATIO: Final = 0.05
 #: Numbers of a regressor that are held at once.
 _MAX_BLOCK_NUMBERS: Final = 250_000
-#: Columns that no state moves are found at so many.
-_PROBE_STATES: Final = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +179,6 @@ def _blocks(dyn: Dynamics, unknowns: Unknowns, data: Measurements) -> Iterator[t
 def _used(dyn: Dynamics, unknowns: Unknowns) -> list[NDArray[np.intp]]:
     """Return the columns that each velocity's torque depends on: those of bodies that it carries."""
     model, rng = dyn.model, np.random.default_rng(0)
-    q, v = model.random_state(rng, _PROBE_STATES)
-    Y = dyn._evaluate("regressor", unknowns.columns, q=q, v=v, a=rng.standard_normal((_PROBE_STATES, model.nv)))
+    q, v = model.random_state(rng, PROBES)
+    Y = dyn._evaluate("regressor", unknowns.columns, q=q, v=v, a=rng.standard_normal((PROBES, model.nv)))
     return [np.flatnonzero(Y[:, j].any(axis=0)) for j in range(model.nv)]

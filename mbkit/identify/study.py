@@ -9,12 +9,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, real, shown
+from mbkit._check import PRINTED, Array, real, shown
 from mbkit._warn import warn
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, MbkitWarning
 from mbkit.identify.consistency import ENTROPIC, PRIORS, consistent, nearest
-from mbkit.identify.least_squares import MIN_NOISE_RATIO, Fit, fit, stacked
+from mbkit.identify.least_squares import Fit, fit, stacked
 from mbkit.identify.measurements import REST_SPEED_RATIO, Equations, Measurements, Unknowns, equations
 from mbkit.identify.motion_noise import bias, motion_noise
 from mbkit.identify.result import SIGNIFICANT_DEVIATIONS, Identification, IdentifiedParameter, Residual, Undetermined
@@ -154,7 +154,7 @@ def identify(
     off = _bias(model, unknowns, data, fitted, length, weights is not None)
     values = fitted.values
     if physical:
-        noise = np.maximum(fitted.noise, MIN_NOISE_RATIO * (max(x.size for x in given) or 1.0))
+        noise = np.maximum(fitted.noise, PRINTED * (max(x.size for x in given) or 1.0))
         if weights is not None:
             noise = np.sqrt(np.mean(noise**2)) * np.ones(len(noise))
         values, standard = consistent(stacked(given, noise), unknowns, length, prior or ENTROPIC, prior_weight)

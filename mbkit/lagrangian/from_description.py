@@ -26,12 +26,9 @@ from mbkit.model.elements.motion_laws import MOTION_LAWS, motions_of
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.elements.references import _OF_BODIES, KINDS_OF_PARTS, names_in
 
-#: Velocities up to which equations are written out.
-_MAX_TREE_VELOCITIES: Final = 24
-#: The same with loops or motions in time. A row of 40 four-bars has 81 coordinates.
-_MAX_LOOP_VELOCITIES: Final = 100
-#: The same with what rolls. A bicycle's nine coordinates take half a minute and rows that nobody reads.
-_MAX_ROLLING_VELOCITIES: Final = 7
+#: Velocities up to which equations are written out: of a tree; with loops or motions in time, as a row of 40 four-bars
+#: has 81; and of what rolls, as a bicycle's nine take half a minute and rows that nobody reads.
+_MAX_VELOCITIES: Final = {"tree": 24, "loops": 100, "rolls": 7}
 
 
 def from_model(
@@ -223,10 +220,8 @@ def _too_much(model: Model) -> Iterator[str]:
         )
     if not model.nv:
         yield "no joint of it moves, so there is no equation"
-    bound = model.loops or motions_of(model)
-    most = (
-        _MAX_ROLLING_VELOCITIES if model.holds_velocities else _MAX_LOOP_VELOCITIES if bound else _MAX_TREE_VELOCITIES
-    )
+    bound = "loops" if model.loops or motions_of(model) else "tree"
+    most = _MAX_VELOCITIES["rolls" if model.holds_velocities else bound]
     if model.nv > most:
         yield f"expected at most {most} coordinates to be written out, got {model.nv} coordinates"
 

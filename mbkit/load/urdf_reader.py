@@ -498,10 +498,6 @@ def _element_hint(owner: str, tag: str, known: frozenset[str]) -> str:
 # The model, link by link: the measure of importers
 
 
-# A rotation matrix from a quaternion is off by up to about 5 eps.
-_ROTATION_ERROR: Final = 8 * EPS
-
-
 class Snapper:
     """Rounds entries of rotations and axes that are within `reach` of 0, 1 or -1, and counts them.
 
@@ -509,7 +505,8 @@ class Snapper:
     derived. Entries farther off, such as -3.67e-6 of the angle 1.5708, stay as written.
     """
 
-    def __init__(self, reach: float = _ROTATION_ERROR) -> None:
+    def __init__(self, reach: float = 8 * EPS) -> None:
+        # A rotation matrix from a quaternion is off by up to about 5 eps.
         self._reach = reach
         self.count = 0
         self.largest = 0.0

@@ -28,7 +28,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import TYPED, Array, real, shown
+from mbkit._check import PROBES, TYPED, Array, real, shown
 from mbkit._escape import html, terminal
 from mbkit.errors import InputError, NumericalError
 from mbkit.model import manifold
@@ -54,8 +54,6 @@ _COEFFICIENT_ROUNDING: Final = 1e-10
 _SINGULAR_VALUE_GAP: Final = 100.0
 #: A column whose independent part is this part of the largest one may be eliminated.
 _PIVOT_RATIO: Final = 0.1
-#: Poses at which the motion of a joint is sampled.
-_SAMPLED_POSES: Final = 4
 
 
 def _units() -> tuple[Array, Array]:
@@ -332,15 +330,13 @@ def _points_at_rest(joint: Joint, length: float, tolerance: float) -> tuple[Arra
     Points are homogeneous: (x, 1) at x, and (x, 0) infinitely far in the direction x.
     """
     kind, rng = joint.type, np.random.default_rng(0)
-    q = np.zeros((_SAMPLED_POSES, kind.nq))
+    q = np.zeros((PROBES, kind.nq))
     if kind.quaternion is not None:
         q[:, kind.quaternion + 3] = 1.0
     place = _frame(joint) @ _pose(joint, list(q[:1].T), 1)[0]
-    at = list(kind.integrate(q, rng.standard_normal((_SAMPLED_POSES, kind.nv))).T)
+    at = list(kind.integrate(q, rng.standard_normal((PROBES, kind.nv))).T)
     units = np.diag([length if k in kind.lengths else 1.0 for k in range(kind.nv)])
-    motions = np.concatenate(
-        [np.zeros((1, 4)), *(_rate(joint, at, list(v), _SAMPLED_POSES).reshape(-1, 4) for v in units)]
-    )
+    motions = np.concatenate([np.zeros((1, 4)), *(_rate(joint, at, list(v), PROBES).reshape(-1, 4) for v in units)])
     motions[:, 3] /= length
     _, sizes, axes = np.linalg.svd(motions)
     moving = int(np.sum(sizes > tolerance * sizes[0]))

@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mbkit import spatial
-from mbkit._check import ITERATED, Array
+from mbkit._check import COMPLEX_STEP, ITERATED, Array
 from mbkit.errors import InputError, UnsupportedError
 
 Scalars = Sequence[Any]
@@ -420,8 +420,6 @@ def kind_of(name: str) -> JointType:
 
 _ATTRIBUTES: Final = tuple(JointType.__annotations__)
 _REAL: Final = SimpleNamespace(sin=np.sin, cos=np.cos)
-#: Complex step: derivatives to rounding.
-_COMPLEX_STEP: Final = 1e-30
 
 
 def register_joint_type(joint_type: JointType) -> JointType:
@@ -529,7 +527,7 @@ def _formula_faults(joint_type: JointType) -> Iterator[str]:
     nq, nv, k = joint_type.nq, joint_type.nv, joint_type.quaternion
     try:
         D = np.array([joint_type.qdot(q, e) for e in np.eye(nv).tolist()], dtype=float).T
-        moved = [x + 1j * _COMPLEX_STEP * r for x, r in zip(q, joint_type.qdot(q, v), strict=True)]
+        moved = [x + 1j * COMPLEX_STEP * r for x, r in zip(q, joint_type.qdot(q, v), strict=True)]
         R, p = (np.array(x, dtype=complex) for x in joint_type.placement(_REAL, joint, moved))
         linear, angular = (np.array(x, dtype=float) for x in joint_type.twist(_REAL, joint, q, v))
         g, momentum = np.arange(1.0, nq + 1), np.arange(1.0, nv + 1)
@@ -545,7 +543,7 @@ def _formula_faults(joint_type: JointType) -> Iterator[str]:
         return
     if not np.abs(R.real @ R.real.T - np.eye(3)).max() < ITERATED or not np.linalg.det(R.real) > 0:
         yield "placement: R is not a rotation matrix"
-    rate, spin = R.real.T @ p.imag / _COMPLEX_STEP, R.real.T @ R.imag / _COMPLEX_STEP
+    rate, spin = R.real.T @ p.imag / COMPLEX_STEP, R.real.T @ R.imag / COMPLEX_STEP
     turning = np.array([spin[2, 1], spin[0, 2], spin[1, 0]])
     if not np.abs([linear - rate, angular - turning]).max() < ITERATED * max(1.0, np.abs(rate).max()):
         x = [np.round(y, 6).tolist() for y in (rate, turning, q, linear, angular)]
@@ -574,8 +572,8 @@ def _structure(joint_type: JointType, q: list[float], D: Array) -> Array:
 
     def slope(direction: Array, unit: list[float]) -> Array:
         """Return the derivative of a column along a direction."""
-        moved = [x + 1j * _COMPLEX_STEP * r for x, r in zip(q, direction, strict=True)]
-        return np.asarray(np.imag(joint_type.qdot(moved, unit)) / _COMPLEX_STEP)
+        moved = [x + 1j * COMPLEX_STEP * r for x, r in zip(q, direction, strict=True)]
+        return np.asarray(np.imag(joint_type.qdot(moved, unit)) / COMPLEX_STEP)
 
     slopes = np.array([[slope(D[:, i], e) for e in units] for i in range(nv)])
     brackets = slopes - slopes.transpose(1, 0, 2)

@@ -22,7 +22,6 @@ PICTURES: Final = (".png",)
 #: Triangles of a frame, which Matplotlib draws in about a tenth of a second.
 MAX_FILM_TRIANGLES: Final = 6_000
 _INCHES: Final = (6.4, 4.8)
-_DPI: Final = 100
 _KEY: Final = np.array([0.35, -0.45, 0.82]) / np.linalg.norm([0.35, -0.45, 0.82])
 
 
@@ -33,7 +32,7 @@ def write(scene: Scene, path: Path, fps: float) -> None:
         from matplotlib.animation import writers
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
-    fig = Figure(figsize=_INCHES, dpi=_DPI, facecolor="#e6ebf1")
+    fig = Figure(figsize=_INCHES, dpi=100, facecolor="#e6ebf1")
     FigureCanvasAgg(fig)
     axis = fig.add_axes((0, 0, 1, 1))
     drawing = _Drawing(scene, axis)
@@ -46,7 +45,7 @@ def write(scene: Scene, path: Path, fps: float) -> None:
         if not writers.is_available(name):
             raise UnsupportedError(f"{suffix[1:].upper()} needs {name}, which is not installed; {install}")
         writer = writers[name](fps=fps)  # type: ignore[arg-type]  # any number does
-        with writer.saving(fig, str(path), _DPI):
+        with writer.saving(fig, str(path), fig.dpi):
             for k in range(len(scene.t)):
                 drawing.frame(k)
                 writer.grab_frame()

@@ -11,10 +11,9 @@ import mpmath
 import numpy as np
 import sympy as sp
 
-from mbkit._check import ROUNDING
+from mbkit._check import PROBES, ROUNDING
 from mbkit._warn import warn
 from mbkit.errors import InputError, MbkitWarning
-from mbkit.lagrangian.trig.shortest_form import PROBE_PLACES
 from mbkit.lagrangian.trig.simplify import (
     MAX_SIMPLIFIED_OPERATIONS,
     PROBE_DIGITS,
@@ -82,7 +81,7 @@ def _quadratic(x: sp.Expr, velocities: Sequence[sp.Symbol]) -> bool:
     """Return whether an expression is of second degree at most: along random lines its third differences are zero."""
     probe = RandomEvaluation([x], velocities)
     with mpmath.workdps(PROBE_DIGITS):
-        for seed in range(PROBE_PLACES):
+        for seed in range(PROBES):
             start, direction = probe.place(2 * seed), probe.place(2 * seed + 1)
             # Through velocities of both signs, where what has a kink shows it.
             places = ({c: y / 3 + s * direction[c] if c in velocities else y for c, y in start.items()} for s in _STEPS)
@@ -115,7 +114,7 @@ def require_inertia(M: sp.ImmutableMatrix, velocities: Sequence[sp.Symbol], J: s
         names = ", ".join(w.name for w in idle)
         raise InputError(f"T: the mass matrix is singular everywhere: no kinetic energy has {names}{bound}")
     probe = RandomEvaluation([*M, *J])
-    for seed in range(PROBE_PLACES):
+    for seed in range(PROBES):
         values = probe(probe.place(seed))
         if values is None:
             # No judgement where it has no value.
@@ -158,7 +157,7 @@ def warn_of_negative(
     if None in numbers.values():
         return
     probe, n, direction = RandomEvaluation([*M]), len(velocities), None
-    for seed in range(2 * PROBE_PLACES):
+    for seed in range(2 * PROBES):
         # Small deflections too: what holds for these alone, as of beams, may be negative far away.
         place = {s: x * _NEAR_ZERO_FACTOR ** (seed % 2) for s, x in probe.place(seed).items()}
         entries = probe({**place, **{s: mpmath.mpf(x) for s, x in numbers.items()}})

@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit import catalog
+from mbkit._check import ROUNDING
 from mbkit.errors import MbkitError
 from mbkit.lagrangian.energies.charts import chart_names
 from mbkit.load.urdf_reader import Snapper
@@ -40,8 +41,6 @@ _LETTERS: Final = {
 }
 _LETTER: Final = re.compile(r"([A-Za-z]|alpha|beta|gamma|delta|theta|phi|psi)(_?\d+)?")
 _USUAL: Final = {"gravity": "g", "mass": "m", "length": "l", "stiffness": "k", "damping": "d", "inertia": "J"}
-#: Two descriptions are the same where their numbers differ by rounding only.
-_EQUAL_NUMBERS_RATIO: Final = 1e-13
 
 
 def in_symbols(model: Model) -> Model | None:
@@ -63,10 +62,7 @@ def in_symbols(model: Model) -> Model | None:
             moved = symbolic.with_nominal(values)
             pairs = zip(_content(moved)[1], numbers, strict=True)
             if all(
-                np.allclose(
-                    x, y, rtol=_EQUAL_NUMBERS_RATIO, atol=_EQUAL_NUMBERS_RATIO * float(np.abs(y).max(initial=0.0))
-                )
-                for x, y in pairs
+                np.allclose(x, y, rtol=ROUNDING, atol=ROUNDING * float(np.abs(y).max(initial=0.0))) for x, y in pairs
             ):
                 zeros = {name: 0.0 for name, x in values.items() if x == 0.0}
                 named = moved.with_parameters(**zeros) if zeros else moved
@@ -167,7 +163,7 @@ def _solved(symbolic: Model, model: Model) -> dict[str, float]:
 def _rounded(x: float) -> float:
     """Return the shorter decimal where a number is one to rounding."""
     short = float(f"{x:.12g}")
-    return short if abs(short - x) <= _EQUAL_NUMBERS_RATIO * abs(x) else x
+    return short if abs(short - x) <= ROUNDING * abs(x) else x
 
 
 def _evaluated(expression: Expression, values: Mapping[str, float]) -> float:

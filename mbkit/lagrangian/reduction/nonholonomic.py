@@ -30,7 +30,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, real, rows
+from mbkit._check import PROBES, Array, real, rows
 from mbkit._escape import terminal
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.lagrangian.energies.energy_form import (
@@ -48,7 +48,6 @@ from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned
 from mbkit.lagrangian.reduction.hamilton import ConservedQuantity, numbers_at
 from mbkit.lagrangian.reduction.quasi_equations import in_quasi_velocities, quasi_equations
-from mbkit.lagrangian.trig.shortest_form import PROBE_PLACES
 from mbkit.lagrangian.trig.simplify import (
     PROBE_DIGITS,
     ZERO_PROBE_RATIO,
@@ -494,7 +493,7 @@ def _rank(columns: Sequence[sp.Matrix]) -> int:
     whole = sp.Matrix.hstack(*columns)
     probe = RandomEvaluation([*whole])
     best = 0
-    for seed in range(PROBE_PLACES):
+    for seed in range(PROBES):
         values = probe(probe.place(seed))
         if values is None:
             continue

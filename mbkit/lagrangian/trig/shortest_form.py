@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import sympy as sp
 
+from mbkit._check import PROBES
 from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing, gather
 
 #: Terms of a sum that is combined, and angles whose products of cosines and sines are looked for.
@@ -215,8 +216,6 @@ def _power(k: int, kept: int) -> dict[tuple[int, int], int]:
 
 # Sums of products of atoms: what their terms share, and whether they are products of sums.
 
-#: Random places at which a property of expressions is tested.
-PROBE_PLACES: Final = 4
 #: Possible terms up to which a product of sums is looked for.
 _MAX_DENSE_TERMS: Final = 50_000
 
@@ -256,7 +255,7 @@ def _irreducible(poly: Poly) -> bool:
     numbers = [int(v * scale) for v in poly.values()]
     shared, rng = gcd(*numbers), Random(0)
     for i, highest in enumerate(max(es) for es in zip(*rows, strict=True)):
-        for _ in range(PROBE_PLACES if highest == 1 else 0):
+        for _ in range(PROBES if highest == 1 else 0):
             at = [rng.randrange(1_000, 1_000_000) for _ in atoms]
             parts = [0, 0]
             for row, x in zip(rows, numbers, strict=True):

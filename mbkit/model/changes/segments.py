@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import TYPED, count
+from mbkit._check import PRINTED, TYPED, count
 from mbkit.errors import UnsupportedError
 from mbkit.model.builder import ModelBuilder
 from mbkit.model.elements.beams import BeamEnd
@@ -19,8 +19,6 @@ from mbkit.model.parameters import nominal
 from mbkit.model.parts import Joint
 
 SEGMENTED: Final = Path("segmented", "segmented: not known of", ALL)
-#: Part of a segment's inertia that it has about its own axis: a beam has none, and MuJoCo takes no body without.
-_AXIAL_INERTIA_RATIO: Final = 1e-6
 
 
 def segmented(model: Model, segments: int) -> Model:
@@ -96,7 +94,8 @@ def _add_chain(b: ModelBuilder, joint: Joint, n: int, EI: list[Any], tau: Any, r
 
     def segment(body: str, long: float) -> None:
         J = rho * (long**3 / 12)
-        b.add_body(body, mass=rho * long, com=(long / 2, 0.0, 0.0), inertia=[_AXIAL_INERTIA_RATIO * J, J, J])
+        # A beam has no inertia about its own axis, and MuJoCo takes no body without.
+        b.add_body(body, mass=rho * long, com=(long / 2, 0.0, 0.0), inertia=[PRINTED * J, J, J])
 
     before, at, last = joint.parent, 0.0, h
     if any(nominal(x) for x in EI):

@@ -26,14 +26,9 @@ _MAX_MODES: Final = 10
 _MAX_POLYNOMIAL_DEGREE: Final = 20
 _RULE: Final = np.polynomial.legendre.leggauss(96)
 #: Difference of two exact rules by the fine one's rounding; one point more gains a factor of 20.
-_RULE_ROUNDING: Final = 500 * EPS
 _IDENTITY: Final[Rows] = np.eye(3).tolist()
 #: The straight line from the root.
 _ROOTED: Final = Polynomial((0.0, 1.0))
-
-
-#: Lengths, m, of which the third power keeps its digits beside 1.
-SHORTEST, LONGEST = 1e-30, 1e30
 
 
 def _unit_rule(points: Any, weights: Any) -> tuple[Array, Array]:
@@ -266,7 +261,8 @@ def beam_types(length: float, modes: Modes, planes: int) -> tuple[BeamEnd, tuple
     size = np.sqrt(np.diag(exact))
     for points in range(2, len(fine)):
         xi, weights = _unit_rule(*np.polynomial.legendre.leggauss(points))
-        if (np.abs(moments(xi, weights) - exact) / size / size[:, None]).max() < _RULE_ROUNDING:
+        # The difference of two exact rules is the fine one's rounding; one point more gains a factor of 20.
+        if (np.abs(moments(xi, weights) - exact) / size / size[:, None]).max() < 500 * EPS:
             break
 
     def blocks(A: Array) -> Array:

@@ -9,10 +9,10 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, shown
+from mbkit._check import MAX_MAGNITUDE, Array, shown
 from mbkit._imports import from_above
 from mbkit.errors import MbkitError
-from mbkit.model.elements.beams import LONGEST, SHORTEST, beam_types, modes_of
+from mbkit.model.elements.beams import beam_types, modes_of
 from mbkit.model.elements.forces import (
     DISPLACEMENT,
     POINT,
@@ -465,8 +465,10 @@ class ElementBuilder:
             value = nominal(x)
             if len(read.faults) == known and (value < 0 or (above and value == 0)):
                 read.faults.append(f"{item}: {what}: expected a number {'above' if above else 'from'} 0, got {value:g}")
-        if len(read.faults) == known and not SHORTEST <= long <= LONGEST:
-            read.faults.append(f"{item}: length: expected a number from {SHORTEST:g} to {LONGEST:g}, got {long:g}")
+        if len(read.faults) == known and not 1 / MAX_MAGNITUDE <= long <= MAX_MAGNITUDE:
+            # The third power of a length keeps its digits beside 1.
+            bounds = f"{1 / MAX_MAGNITUDE:g} to {MAX_MAGNITUDE:g}"
+            read.faults.append(f"{item}: length: expected a number from {bounds}, got {long:g}")
         string = all(map(_is_zero, EI))
         good, found = self._asked(item, (modes, shapes), lambda: modes_of(modes, shapes, string=string))
         root = f"{name}.root"

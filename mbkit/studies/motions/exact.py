@@ -15,7 +15,7 @@ from scipy.interpolate import BarycentricInterpolator
 from scipy.spatial.transform import Rotation
 from scipy.special import ellipj, ellipkinc, ellipkm1, elliprf, elliprj
 
-from mbkit._check import Array
+from mbkit._check import COMPLEX_STEP, Array
 
 #: A function from times (K,) to q (K, nq).
 Exact = Callable[[Array], Array]
@@ -28,7 +28,6 @@ Exact = Callable[[Array], Array]
 # VI.3 on singular perturbations, IV.5 on Radau IIA).
 
 _RADAU_STAGES: Final = 8
-_COMPLEX_STEP: Final = 1e-30
 _MAX_NEWTON_ITERATIONS: Final = 30
 
 #: F(y, ẏ), each (s, n), real or complex.
@@ -77,10 +76,10 @@ def _step(residual: Residual, y: Array, before: Array | None, h: float) -> Array
 def _jacobians(residual: Residual, Y: Array, dY: Array) -> tuple[Array, Array]:
     """Return ∂F/∂y and ∂F/∂ẏ, (s, n, n) each, of one evaluation at all disturbed states."""
     s, n = Y.shape
-    unit = np.broadcast_to(1j * _COMPLEX_STEP * np.eye(n)[:, None], (n, s, n))
+    unit = np.broadcast_to(1j * COMPLEX_STEP * np.eye(n)[:, None], (n, s, n))
     disturbed = np.concatenate([Y + unit, np.broadcast_to(Y, (n, s, n))])
     rates = np.concatenate([np.broadcast_to(dY, (n, s, n)), dY + unit])
-    F = residual(disturbed.reshape(-1, n), rates.reshape(-1, n)).imag.reshape(2, n, s, n) / _COMPLEX_STEP
+    F = residual(disturbed.reshape(-1, n), rates.reshape(-1, n)).imag.reshape(2, n, s, n) / COMPLEX_STEP
     return np.moveaxis(F[0], 0, -1), np.moveaxis(F[1], 0, -1)
 
 
@@ -123,7 +122,7 @@ class HangingChain:
             return np.asarray((x[0] * pull.sum(axis=1) + _GRAVITY * self._w * np.sin(phi)) / self._w)
 
         for _ in range(20):
-            J = np.stack([residual(x + 1j * _COMPLEX_STEP * e).imag / _COMPLEX_STEP for e in np.eye(n)], axis=1)
+            J = np.stack([residual(x + 1j * COMPLEX_STEP * e).imag / COMPLEX_STEP for e in np.eye(n)], axis=1)
             x = x - np.linalg.solve(J, residual(x))
         return np.diff([0.0, angle, *x[1:]])
 
