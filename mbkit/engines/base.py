@@ -7,7 +7,7 @@ quantities that follow from others are here.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Self, TypeVar
@@ -49,6 +49,7 @@ from mbkit.model.elements.paths import Path
 from mbkit.model.quantities import OF_BODIES
 from mbkit.model.quantities import QUANTITIES as TABLE
 from mbkit.model.rolling import discs_of
+from mbkit.model.validation import listing
 
 if TYPE_CHECKING:
     from mbkit.engines.elements.compiled_forces import CompiledForces
@@ -67,15 +68,9 @@ _GATES: Final = {
 #: Bits of a double's significand.
 DOUBLE_BITS: Final = 53
 #: Names in a list of an error message.
-_MAX_NAMES: Final = 3
+MAX_NAMES: Final = 3
 
 _Dynamics = TypeVar("_Dynamics", bound="Dynamics")
-
-
-def first_names(texts: Iterable[str], more: str = " and {} more") -> str:
-    """Return the first few texts of a list, and how many more there are."""
-    all_ = list(texts)
-    return ", ".join(all_[:_MAX_NAMES]) + (more.format(len(all_) - _MAX_NAMES) if all_[_MAX_NAMES:] else "")
 
 
 #: Joints of several velocities that turn rotors.
@@ -619,16 +614,16 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         # A joint that moves no mass is the likeliest cause; say it first.
         inconsistent = sorted(self.model.nonphysical, key=lambda pair: "no mass moves" not in pair[1])
         if inconsistent:
-            return f"; suspect: {first_names(f'{name!r} ({why})' for name, why in inconsistent)}"
+            return f"; suspect: {listing([f'{name!r} ({why})' for name, why in inconsistent], MAX_NAMES)}"
         springs = [repr(s.name) for s in self.model.springs if s.needs_direction]
         if springs:
             return (
                 f"; possible cause: a point spring with a damper or a rest length has no direction where "
-                f"its length is zero: {', '.join(springs[:_MAX_NAMES])}"
+                f"its length is zero: {', '.join(springs[:MAX_NAMES])}"
             )
         discs = [repr(x.name) for x in discs_of(self.model)]
         if discs:
-            return f"; possible cause: a disc that lies flat on its plane: {', '.join(discs[:_MAX_NAMES])}"
+            return f"; possible cause: a disc that lies flat on its plane: {', '.join(discs[:MAX_NAMES])}"
         return "; perhaps links without mass, or numbers so large that they overflow"
 
 

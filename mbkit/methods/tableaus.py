@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import EPS, Array
+from mbkit._check import EPS, ROUNDING, Array
 from mbkit.errors import InputError
 from mbkit.methods.one_step import StageRates, Stages
 from mbkit.model.integration_space import Space
@@ -58,12 +58,6 @@ def _stage_weights(A: Array, tree: Tree) -> Array:
     return out
 
 
-#: Largest difference of two times that are the same to rounding, in steps.
-_MAX_TIME_ROUNDING: Final = 1e-12
-#: Largest sum of a Rosenbrock method's published coefficients, of sixteen digits, that is zero.
-_MAX_SUM_ROUNDING: Final = 1e-12
-
-
 def rounding_of_condition(A: Array, b: Array, tree: Tree) -> float:
     """Return what rounding can leave of an order condition, whatever the order in which its sums are taken.
 
@@ -102,7 +96,7 @@ def _numbers(tableau: str, name: str, value: ArrayLike) -> Array:
 def _times(rows: Array) -> Array:
     sums = np.array([fsum(row) for row in rows])
     # No stage lies behind the end of the step by a rounding.
-    return np.where(np.abs(sums - 1.0) < _MAX_TIME_ROUNDING, 1.0, sums)
+    return np.where(np.abs(sums - 1.0) < ROUNDING, 1.0, sums)
 
 
 def extrapolation_weights(times: Sequence[float], at: Iterable[float]) -> Array:
@@ -183,7 +177,7 @@ class Tableau:
     @property
     def ends_at_a_stage(self) -> bool:
         """Whether the last stage is at the end of the step, near the state there."""
-        return self.stages > 1 and bool(abs(self.c[-1] - 1) < _MAX_TIME_ROUNDING)
+        return self.stages > 1 and bool(abs(self.c[-1] - 1) < ROUNDING)
 
     @cached_property
     def _rows(self) -> list[tuple[float, Array]]:
@@ -383,7 +377,7 @@ class RosenbrockTableau:
     def d(self) -> Array:
         """Factors of ∂f/∂t, shape (s,)."""
         sums = np.array([fsum(row) for row in self._coupling])
-        return np.where(np.abs(sums) < _MAX_SUM_ROUNDING, 0.0, sums)
+        return np.where(np.abs(sums) < ROUNDING, 0.0, sums)
 
     @property
     def _coupling(self) -> Array:

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
-from mbkit.engines.base import at_times, first_names
+from mbkit.engines.base import MAX_NAMES, at_times
 from mbkit.engines.constrained import TAKES_PART
+from mbkit.model.validation import listing
 
 if TYPE_CHECKING:
     from mbkit.engines.constraint_manifold import Manifold
@@ -117,7 +118,7 @@ class Passage:
         why = self._undetermined()
         if not why:
             return ""
-        rows = first_names([self._manifold.names[k] for k in self.rows])
+        rows = listing([self._manifold.names[k] for k in self.rows], MAX_NAMES)
         return f"at a singular pose, where {rows} depend on each other, and {why}"
 
     def _undetermined(self) -> str:

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from mbkit import _interrupt
+from mbkit._check import ITERATED
 from mbkit._escape import xml_holds
 from mbkit._version import __version__
 from mbkit.engines import dynamics
@@ -28,8 +29,6 @@ from mbkit.studies.explain.study import explain
 from mbkit.studies.explain.terms import Gap, evaluated, gaps, model_terms, states_of, worst
 
 FORMATS: Final = ("mjcf", "urdf")
-#: The largest relative error that rounding of rotations and of principal axes makes.
-_TOLERANCE: Final = 1e-11
 _STATES: Final = 5
 
 
@@ -130,12 +129,12 @@ def _to_mjcf(model: Model) -> Converted:
     values = evaluated(back, at)
     if model.needs.loops:
         own = dynamics(model, DERIVED, compile=False).constraint_residual(at.q)
-        if not np.abs(back.constraint_residual(at.q) - own).max() < _TOLERANCE * max(1.0, np.abs(own).max()):
+        if not np.abs(back.constraint_residual(at.q) - own).max() < ITERATED * max(1.0, np.abs(own).max()):
             raise MbkitError(f"convert: loops of {model.name} read back otherwise; please report this model")
     difference = gaps(model_terms(model, at), values, at, model)
-    if worst(difference) > _TOLERANCE:
+    if worst(difference) > ITERATED:
         why = next((n for n in notes if n.startswith("principal moments")), "please report this model")
-        off = ", ".join(f"{g.term} by {g.relative:.1e} at {g.joint}" for g in difference if g.relative > _TOLERANCE)
+        off = ", ".join(f"{g.term} by {g.relative:.1e} at {g.joint}" for g in difference if g.relative > ITERATED)
         off = off or "in its coordinates"
         raise MbkitError(f"convert: what was written of {model.name} reads back otherwise: {off}; {why}")
     return Converted(model.name, "mjcf", text, difference, notes)
@@ -149,7 +148,7 @@ def _to_urdf(model: Model) -> Converted:
         path.write_text(text, encoding="utf-8")
         with warnings.catch_warnings(action="ignore", category=MbkitWarning):
             back = load(path, gravity=model.gravity, nonphysical="warn")
-    explanation = explain(model, back, samples=_STATES, tolerance=_TOLERANCE, names=("description", "URDF"))
+    explanation = explain(model, back, samples=_STATES, tolerance=ITERATED, names=("description", "URDF"))
     if explanation.acting or not (explanation.agree or explanation.massless):
         reasons = "; ".join(map(str, explanation.acting)) or explanation.verdict
         raise MbkitError(

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array
+from mbkit._check import CONSISTENT, Array
 from mbkit._reproducible import DEPENDENT, dependent, unit_rows
 from mbkit.engines.constrained import ASKED, Constrained, singular_pose
 from mbkit.errors import InputError, UnknownNameError
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
 #: Every joint acts.
 LEAST: Final = "least"
-#: Residual of a consistent row by rounding and a few typed digits, relative to its size times the acceleration's.
-_CONSISTENT: Final = 1e-8
 _OF_A_TREE: Final = "inverse_dynamics(q, v, a) is the force of the joints of a tree"
 ACTUATOR_FORCES: Final = Path("actuator forces", "actuator_forces: not known of", ALL, asks=ASKED, instead=_OF_A_TREE)
 
@@ -166,7 +164,7 @@ class Actuation(Constrained):
         rates, sizes, left = numbers[:, n + kept : n + kept + m], numbers[:, n + kept + m : -1], numbers[:, -1]
         states, accelerations = np.atleast_2d(q), np.atleast_2d(a)
         fast = np.maximum(1.0, np.abs(accelerations).max(axis=1, initial=0.0))[:, None]
-        broken = ~(np.abs(rates) <= _CONSISTENT * np.maximum(sizes, 1.0) * fast).all(axis=1)
+        broken = ~(np.abs(rates) <= CONSISTENT * np.maximum(sizes, 1.0) * fast).all(axis=1)
         flat = ~(sizes.min(axis=1) > DEPENDENT * sizes.max(axis=1))
         for k in np.flatnonzero(~(left > DEPENDENT**2) | flat | broken).tolist():
             own = self._of_samples([k])
@@ -177,7 +175,7 @@ class Actuation(Constrained):
 
     def _require_consistent(self, rates: Array, sizes: Array, a: Array) -> None:
         """Refuse accelerations that break the constraints."""
-        most = _CONSISTENT * np.maximum(sizes, 1.0) * max(1.0, float(np.abs(a).max(initial=0.0)))
+        most = CONSISTENT * np.maximum(sizes, 1.0) * max(1.0, float(np.abs(a).max(initial=0.0)))
         if not (np.abs(rates) <= most).all():
             rows = zip(self._row_choice.independent_names, rates, most, strict=True)
             left = ", ".join(f"{name} by {x:.3g}" for name, x, high in rows if not abs(x) <= high)

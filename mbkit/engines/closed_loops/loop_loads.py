@@ -27,8 +27,6 @@ from mbkit.model.elements.paths import Path
 from mbkit.model.loops import LOOP_KINDS, LOOP_ROWS, LoopEnds
 from mbkit.model.parts import Loop
 
-#: Rest of forces after the constraints' own, relative to their size, up to which a motion is that of a force.
-_MEANT: Final = 1e-8
 LOOP_LOADS: Final = Path(
     "loads of loops", "", LOADS.carries, LOADS.why, asks=(frozenset(f"loop.{x}" for x in LOOP_KINDS), "it has no loops")
 )
@@ -126,7 +124,7 @@ class LoopLoads(Actuation, Loads):
             return self._evaluate("loads_under_force", joints, frames, axes_named(axes), **states)
         out = self._evaluate("loads_of_motion", joints, frames, axes_named(axes), **states)
         left, size = (np.ravel(out[..., -1, k]) for k in range(2))
-        if len(bad := np.flatnonzero(~(left <= _MEANT * size))):
+        if len(bad := np.flatnonzero(~(left <= CONSISTENT * size))):
             k = int(bad[0])
             where = f" in sample {k}" if out.ndim > 2 else ""
             raise InputError(

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import ROUNDING, Array
 from mbkit._reproducible import unit_rows
 from mbkit.derivation.constraints import choose_rows
 from mbkit.engines.constraint_manifold import Manifold, refuse_unreachable, require_independent
@@ -28,8 +28,6 @@ _BESIDE_START: Final = 1e-7
 _SLOPE: Final = 30.0
 #: Least apartness of rows at a random configuration, relative to that at a closed one that is known.
 _WELL: Final = 0.3
-#: Residual that Newton's last step may leave, relative to each row's size.
-_REACHED: Final = 1e-12
 
 
 class ConsistentStates:
@@ -120,7 +118,7 @@ def flowed(manifold: Manifold, q: Array, v: Array, well: float) -> tuple[Array, 
         if not np.linalg.norm(model.difference(*both)) <= _SLOPE * np.linalg.norm(aside):
             return None
     q, _ = both
-    if not (np.abs(f) <= _REACHED * (1 + np.abs(both).max())).all():
+    if not (np.abs(f) <= ROUNDING * (1 + np.abs(both).max())).all():
         return None
     if not manifold.apartness(q) > well:
         return None

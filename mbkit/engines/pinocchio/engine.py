@@ -17,7 +17,7 @@ import pinocchio as pin
 
 from mbkit._check import EPS, TWO_TURNS, Array
 from mbkit.engines import known_defects
-from mbkit.engines.base import Dynamics, first_names
+from mbkit.engines.base import MAX_NAMES, Dynamics
 from mbkit.engines.elements.passive import JointPassive
 from mbkit.engines.frames_and_momenta import ALIGNED, WORLD
 from mbkit.engines.pinocchio.bodies import PinocchioBodies
@@ -35,6 +35,7 @@ from mbkit.engines.regressors import with_joints
 from mbkit.model import Model
 from mbkit.model.base_parameters import RegressorColumns
 from mbkit.model.manifold import NEAR_UNIT
+from mbkit.model.validation import listing
 
 if TYPE_CHECKING:
     from mbkit.show import Kind
@@ -377,7 +378,7 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
             if 0 < body.mass < EPS:
                 one = pin.Inertia(body.mass, np.array([1.0, 0.0, 0.0]), np.zeros((3, 3)))
                 out += [repr(body.name)] if abs((one + one).lever[0] - 1) > 1e-9 else []
-        return first_names(out)
+        return listing(out, MAX_NAMES)
 
     @cached_property
     def _coriolis_fault(self) -> str:

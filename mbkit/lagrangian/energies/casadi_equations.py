@@ -18,18 +18,17 @@ from mbkit.derivation.mass_matrix_solve import ConstraintFactors, ConstraintTerm
 from mbkit.derivation.model_values import Constants, Values
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian.energies.energy_form import EnergyForm, QuasiVelocities
+from mbkit.lagrangian.energies.kinetic_energy import MAX_SHOWN_LETTERS
 from mbkit.lagrangian.energies.sympy_to_casadi import Conversion
 from mbkit.model import Model
 
-#: Characters of a constraint that a message shows: a loop in space has thousands.
-_MAX_MESSAGE_LENGTH: Final = 100
 #: Largest |D⁻¹| |D|: beyond it rates have less than four digits.
 _SINGULAR_CONDITION: Final = 1e12
 
 
 def _short(x: Any) -> str:
     text = str(x)
-    return text if len(text) <= _MAX_MESSAGE_LENGTH else f"{text[:_MAX_MESSAGE_LENGTH]} ..."
+    return text if len(text) <= MAX_SHOWN_LETTERS else f"{text[:MAX_SHOWN_LETTERS]} ..."
 
 
 class EnergyEquations(ConstraintQuantities, Equations):

@@ -24,6 +24,8 @@ from mbkit.lagrangian.trig.simplify import (
     tidy_short,
 )
 
+#: Characters of a matrix or a constraint that a message shows: of a loop in space it has thousands.
+MAX_SHOWN_LETTERS: Final = 200
 #: Places on each line through the velocities.
 _STEPS: Final = (3, 1, -1, -3)
 
@@ -98,8 +100,6 @@ def _quadratic(x: sp.Expr, velocities: Sequence[sp.Symbol]) -> bool:
 
 #: Coordinates at every other place are nearer to zero by this factor.
 _NEAR_ZERO_FACTOR: Final = 1e-3
-#: Characters of a matrix that a message shows.
-_MAX_MESSAGE_LENGTH: Final = 200
 
 
 def require_inertia(M: sp.ImmutableMatrix, velocities: Sequence[sp.Symbol], J: sp.ImmutableMatrix) -> None:
@@ -132,7 +132,7 @@ def require_inertia(M: sp.ImmutableMatrix, velocities: Sequence[sp.Symbol], J: s
                 sizes = (mpmath.norm(scaled[i, :]) for i in range(n))
                 if abs(mpmath.det(scaled)) > ZERO_PROBE_RATIO * mpmath.fprod(sizes):
                     return
-    matrix = f" {M.tolist()}" if len(str(M)) <= _MAX_MESSAGE_LENGTH else ""
+    matrix = f" {M.tolist()}" if len(str(M)) <= MAX_SHOWN_LETTERS else ""
     raise InputError(
         f"T: its mass matrix{matrix} is singular everywhere: {_unmoved(A, velocities)} can change without kinetic "
         "energy; a velocity is missing, or there is a coordinate too many"

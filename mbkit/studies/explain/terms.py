@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import PRINTED, Array
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import (
@@ -40,8 +40,6 @@ TERM: Final = {term.name: term for term in terms.TERMS}
 TERMS: Final = ("M", "g", "nle", "passive")
 #: Least size by which a force is divided.
 TINY: Final = 1e-300
-#: Largest residual of a consistent state, relative to each row: rounded digits of a description leave as much.
-_CONSISTENT: Final = 1e-6
 #: The term of two whole systems, with their constraints and all forces.
 WHOLE: Final = "accelerations"
 Values = dict[str, Array]
@@ -189,7 +187,7 @@ def _consistent(dyn: Dynamics, q: Array, v: Array) -> bool:
     """Return whether a state keeps the constraints, to the digits that a description leaves of it."""
     J = np.maximum(np.abs(dyn.constraint_jacobian(q)).sum(axis=1), 1.0)
     for rows, x in ((dyn.constraint_residual(q), q), (dyn.constraint_rate(q, v), v)):
-        if not (np.abs(rows) <= _CONSISTENT * J[: len(rows)] * max(1.0, float(np.abs(x).max()))).all():
+        if not (np.abs(rows) <= PRINTED * J[: len(rows)] * max(1.0, float(np.abs(x).max()))).all():
             return False
     return True
 

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from mbkit._check import Array
+from mbkit._check import TYPED, Array
 from mbkit.load.shapes import MassProperties
 from mbkit.show.surfaces import Indices
 from mbkit.show.visuals import Shape
-
-#: Volume of a hull that is a plane or a line, over the cube of its extent.
-_FLAT_RATIO: Final = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +71,7 @@ def _hull(V: Array) -> ConvexHull | None:
         hull = ConvexHull(V)
     except (QhullError, ValueError):
         return None
-    return hull if hull.volume > _FLAT_RATIO * extent**3 else None
+    return hull if hull.volume > TYPED * extent**3 else None
 
 
 def _outward(hull: ConvexHull) -> MassProperties:

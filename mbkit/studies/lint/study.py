@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import real, shown
+from mbkit._check import PRINTED, real, shown
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.registry import PINOCCHIO
 from mbkit.errors import (
@@ -45,8 +45,6 @@ LINT: Final = paths.Path(
     paths.OF_BODIES,
     notes=dict.fromkeys(("row", "speed"), "effort and damping: constraints share the forces"),
 )
-#: Relative difference of a body from its links as a whole.
-_SAME_BODY_ERROR: Final = 1e-6
 
 
 def lint(
@@ -140,7 +138,7 @@ def _links(model: Model) -> Model:
     if model.source.lower().endswith(".urdf"):
         with suppress(MbkitError), warnings.catch_warnings(action="ignore", category=MbkitWarning):
             links = replace(read_links(Path(model.source)), source=model.source)
-            near, parts = Tolerances.of(model, _SAME_BODY_ERROR), defaultdict[str, list[MassProperties]](list)
+            near, parts = Tolerances.of(model, PRINTED), defaultdict[str, list[MassProperties]](list)
             for link in links.bodies:
                 frame, own = model.frame(link.name), MassProperties(link.mass, link.com, link.inertia)
                 parts[frame.body] += [own.moved(frame.rotation, frame.translation)] if link.mass else []
