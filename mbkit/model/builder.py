@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Final, Literal
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit import spatial
-from mbkit._check import Array, finite_array, real, real_array, shown
+from mbkit._check import TYPED, Array, finite_array, real, real_array, shown
 from mbkit._reproducible import length
 from mbkit.errors import InputError, ModelError, NonPhysicalWarning, nearest
 from mbkit.model.elements.declare import ElementBuilder
@@ -58,6 +58,13 @@ class ArgumentReader:
             return self.name(what, value)
         several = tuple(self.name(f"{what}[{i}]", x) for i, x in enumerate(value))
         return several[0] if len(several) == 1 else several
+
+    def choice(self, item: str, what: str, value: Any, known: Collection[str]) -> str:
+        """Return one of these words; the first after a fault."""
+        if isinstance(value, str) and value in known:
+            return value
+        self.faults.append(f"{item}: unknown {what} {shown(value)}; there are {', '.join(map(repr, known))}")
+        return next(iter(known))
 
     def array(self, name: str, value: Any, shape: tuple[int, ...], *, each: bool = False) -> Array:
         """Return finite numbers; a single one stands for `each` of a vector that says so, as of velocities."""
@@ -124,7 +131,7 @@ class ArgumentReader:
             return np.diag(self.quantities(name, value, 3))
         if not _has_expressions(value):
             matrix = self.array(name, value, (3, 3))
-            if np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
+            if np.abs(matrix - matrix.T).max() > TYPED * np.abs(matrix).max():
                 self.faults.append(f"{name} is not symmetric; expected I = Iᵀ")
             return np.asarray((matrix + matrix.T) / 2)
         if shape_of(value) != (3, 3):
@@ -154,7 +161,7 @@ class ArgumentReader:
         if value is None:
             return np.eye(3)
         R = self.array(name, value, (3, 3))
-        if np.abs(R @ R.T - np.eye(3)).max() > 1e-9 or np.linalg.det(R) < 0:
+        if np.abs(R @ R.T - np.eye(3)).max() > TYPED or np.linalg.det(R) < 0:
             self.faults.append(f"{name} is not a rotation matrix; expected R Rᵀ = 1 and det R = 1")
             return np.eye(3)
         return R
@@ -513,13 +520,10 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
         length : float
             Of a rod, m; of no other kind.
         """
-        if not isinstance(kind, str) or kind not in LOOP_KINDS:
-            there = ", ".join(map(repr, LOOP_KINDS))
-            self._read.faults.append(f"loop {shown(name)}: unknown kind {shown(kind)}; there are {there}")
-            kind = "point"
+        ready = {"kind": self._read.choice(f"loop {shown(name)}", "kind", kind, LOOP_KINDS)}
         a = {"body_a": body_a, "rotation_a": rotation_a, "translation_a": translation_a}
         b = {"body_b": body_b, "rotation_b": rotation_b, "translation_b": translation_b}
-        self._add(Loop, "loop", name, a | b | {"length": length}, {"kind": kind})
+        self._add(Loop, "loop", name, a | b | {"length": length}, ready)
 
     def add_blade(
         self,
@@ -607,13 +611,10 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
         >>> mb.dynamics(b.build(), "lagrangian").mobility().degrees_of_freedom
         3
         """
-        if not isinstance(kind, str) or kind not in ROLLING_KINDS:
-            there = ", ".join(map(repr, ROLLING_KINDS))
-            self._read.faults.append(f"no slip {shown(name)}: unknown kind {shown(kind)}; there are {there}")
-            kind = "disc"
+        ready = {"kind": self._read.choice(f"no slip {shown(name)}", "kind", kind, ROLLING_KINDS)}
         a = {"body_a": body_a, "translation_a": translation_a, "axis_a": axis_a, "radius": radius}
         b = {"body_b": body_b, "translation_b": translation_b, "axis_b": axis_b}
-        self._add(NoSlip, "no slip", name, a | b, {"kind": kind})
+        self._add(NoSlip, "no slip", name, a | b, ready)
 
     def note(self, text: str) -> None:
         """Add a sentence to the model's notes."""

@@ -20,6 +20,7 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import COMPLEX_STEP, ITERATED, Array
 from mbkit.errors import InputError, UnsupportedError
+from mbkit.model.quaternions import cross
 
 Scalars = Sequence[Any]
 Rows = list[list[Any]]
@@ -39,9 +40,7 @@ class SingleMotion(NamedTuple):
     advance: Any = 0.0
 
 
-def cross3(a: Scalars, b: Scalars) -> list[Any]:
-    """Return a × b."""
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+cross3: Final = cross
 
 
 def dot3(a: Scalars, b: Scalars) -> Any:

@@ -43,8 +43,7 @@ ARRAYS: Final = Arithmetic(np.sqrt, np.sin, np.cos, np.where)
 
 def cross(a: Components, b: Components) -> list[Any]:
     """Return a × b."""
-    (a0, a1, a2), (b0, b1, b2) = a, b
-    return [a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0]
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
 def product(a: Components, b: Components) -> list[Any]:

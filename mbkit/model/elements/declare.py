@@ -32,8 +32,6 @@ from mbkit.model.parts import Coupler, Prescribed
 
 Axes = Literal["local", "local_world_aligned", "world"]
 Ends = Literal["natural", "clamped", "quintic"]
-_AXES: Final = get_args(Axes)
-_ENDS: Final = get_args(Ends)
 _Vector = ArrayLike | Sequence[Number]
 #: Limit of a beam's amplitudes together, as a part of its length.
 _MAX_DEFLECTION_RATIO: Final = 0.1
@@ -112,10 +110,8 @@ class ElementBuilder:
         item = f"prescribed {shown(joint)}"
         if given := [name for name, x in harmonic.items() if not _is_zero(x)]:
             self._read.faults.append(f"{item}: a law and {given[0]}; expected one of them")
-        if not isinstance(spline, str) or spline not in _ENDS:
-            self._read.faults.append(f"{item}: spline: expected one of {', '.join(_ENDS)}, got {shown(spline)}")
-            return
-        good, pieces = self._asked(item, law, lambda: from_above("formulas").read_spline(law, spline))
+        ends = self._read.choice(item, "spline", spline, get_args(Ends))
+        good, pieces = self._asked(item, law, lambda: from_above("formulas").read_spline(law, ends))
         if not good:
             return
         if pieces is not None:
@@ -276,9 +272,7 @@ class ElementBuilder:
         [-0.4]
         """
         item = f"force {shown(name)}"
-        if not isinstance(axes, str) or axes not in _AXES:
-            self._read.faults.append(f"{item}: axes: expected one of {', '.join(_AXES)}, got {shown(axes)}")
-            axes = "local"
+        own = self._read.choice(item, "axes", axes, get_args(Axes))
         parts = None if force is None and moment is None else [(0.0,) * 3 if x is None else x for x in (force, moment)]
         given = {"formula": (TIME, POINT, TWIST), "potential": (POINT,)}
         formulas, constants = self._formulas(
@@ -289,7 +283,7 @@ class ElementBuilder:
             given=given,
         )
         frame = self._read.name(f"{item}: frame", frame)
-        self._add(FrameForce, "force", name, {}, {"frame": frame, "axes": axes} | formulas | constants)
+        self._add(FrameForce, "force", name, {}, {"frame": frame, "axes": own} | formulas | constants)
 
     def add_gravity_compensation(self, body: str, fraction: Number = 1.0, *, without: Sequence[str] = ()) -> None:
         """Hold a part of a body's weight by a force at its centre of mass, as MuJoCo's ``gravcomp`` does.

@@ -326,8 +326,7 @@ class EditingBuilder:
             Needed where parts of several kinds have the name.
         """
         name, kinds = self._read.name("remove: name", name), {called(k): k for k in KINDS_OF_PARTS[2:]}
-        if kind is not None and (not isinstance(kind, str) or kind not in kinds):
-            self._read.faults.append(f"remove: unknown kind {shown(kind)}; there are {', '.join(map(repr, kinds))}")
+        if kind is not None and self._read.choice("remove", "kind", kind, kinds) != kind:
             return
         having = {k: [x.name for x in self._parts[k]] for word, k in kinds.items() if kind in (None, word)}
         found = [k for k, names in having.items() if name in names]
