@@ -126,7 +126,6 @@ def with_frames(b: Baseline, names: tuple[str, ...]) -> Baseline:
 
 
 def _to_table(b: Baseline) -> dict[str, Any]:
-    """Return the file's text."""
     names = {"q": b.coordinates, "v": b.velocities, "a": b.velocities, "tau": b.velocities}
     refused: dict[str, dict[str, str]] = {}
     for r in b.left_out:
@@ -241,7 +240,6 @@ def _from_table(t: Mapping[str, Any]) -> Baseline:
 
 
 def _whole(rows: Sequence[Sequence[float]]) -> Array:
-    """Return a symmetric matrix from the rows of `_half`."""
     M = np.zeros((len(rows), len(rows)))
     for i, row in enumerate(rows):
         M[i, i + 1 - len(row) : i + 1] = M[i + 1 - len(row) : i + 1, i] = row
@@ -432,7 +430,6 @@ def _key(name: str) -> str:
 
 
 def _value(x: Any) -> str:
-    """Return a number, text or list as TOML."""
     if isinstance(x, (list, tuple)):
         return f"[{', '.join(map(_value, x))}]"
     if isinstance(x, str):

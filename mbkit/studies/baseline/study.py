@@ -340,7 +340,6 @@ def _moved_numbers(a: Baseline, b: Baseline, moved: Versions) -> tuple[ChangedNu
 
 
 def _checked_model(model: object) -> Model:
-    """Return a model that has something to record."""
     checked = require_motion(model, "record")
     checked.require_values("a baseline")
     return checked
@@ -492,7 +491,6 @@ class Comparator:
 
 
 def _allowed(baseline: Baseline, engine: str, term: str) -> float:
-    """Return the error that is still rounding."""
     if term in baseline.own.get(engine, {}):
         return OWN
     recorded = baseline.errors[engine][term]
@@ -614,7 +612,6 @@ def package_of(engine: str) -> str:
 
 
 def _versions_of(engines: Iterable[str]) -> dict[str, str]:
-    """Return the versions that can move numbers of these engines."""
     now = results.versions()
     return {p: now[p] for p in dict.fromkeys([*_SHARED, *map(package_of, engines)])}
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -48,7 +47,7 @@ class RobotOutcome:
 
 
 @dataclass(frozen=True)
-class Sweep:
+class Sweep(results.ResultTable):
     """The outcomes of many robots."""
 
     outcomes: tuple[RobotOutcome, ...]
@@ -130,19 +129,14 @@ class Sweep:
         span = f"{least} to {most}" if least != most else f"{least}"
         return f"{self.verdict}; each against its own derivation evaluated with 34 digits, at {span} states"
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything as plain data; NaN is None."""
-        names = ("passed", "verdict", "counts", "expected", "engines", "samples", "seed", "seconds", "versions")
-        return {name: results.to_plain(getattr(self, name)) for name in (*names, "processor")} | {
-            "robots": [
-                vars(o) | {"comparison": json.loads(o.comparison.to_json()) if o.comparison else None}
-                for o in self.outcomes
-            ]
-        }
+    _derived = ("passed", "verdict", "counts")
+    _listed = "outcomes"
+    _csv_columns = results.columns_of(RobotOutcome)
 
-    def to_json(self) -> str:
-        """Return the sweep as JSON. NaN becomes null."""
-        return json.dumps(self.to_dict(), indent=1, allow_nan=False)
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        out = super().to_dict()
+        return out | {"robots": out.pop("outcomes")}
 
 
 def _of(text: Callable[[Any], str]) -> Callable[[RobotOutcome], str]:

@@ -582,7 +582,6 @@ def _accelerations_text(motion: Motion, best: Reference) -> str:
 
 
 def _accelerations(dyn: Dynamics, t: Array, q: Array, v: Array, tau: Array) -> Array:
-    """Return accelerations at states of different times."""
     if dyn.model.time_parameter is None:
         return np.asarray(dyn.forward_dynamics(q, v, tau))
     states = zip(t.tolist(), q, v, tau, strict=True)

@@ -110,7 +110,6 @@ def _axes(ax: Axes | None, rows: int, height: float) -> Axes:
 
 
 def _map(case: CaseResult, palette: Palette, given: Axes | None) -> Figure:
-    """Draw one case."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch, Rectangle
 

@@ -274,7 +274,6 @@ def curve_lines(result: WorkPrecision) -> list[CurveLine]:
 
 
 def _why_none(curve: Curve) -> str:
-    """Return why a curve has no error at all."""
     return next((p.note for p in curve.points if p.note), curve.ended or "no run came to an end")
 
 

@@ -474,7 +474,6 @@ class Sweep:
 
 
 def _measure(problem: Problem, truth: Truth, one: Settings, repeats: int, seed: int, budget: TimeBudget) -> Outcome:
-    """Measure one curve in a worker."""
     sweep = Sweep(problem, truth, [one], repeats, seed, replace(budget, begun=time.process_time()))
     deque(sweep.steps(), maxlen=0)
     return sweep.outcomes()[0]

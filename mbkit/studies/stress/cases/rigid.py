@@ -110,7 +110,6 @@ def light_finger(factor: float) -> Problem:
 
 
 def _with(model: Model, *changed: Body) -> Model:
-    """Return the model with some bodies changed."""
     by_name = {body.name: body for body in changed}
     return replace(model, bodies=tuple(by_name.get(body.name, body) for body in model.bodies))
 
