@@ -96,7 +96,7 @@ _HANDED_DOWN = {
     "fixed_step": "mbkit.simulate.solvers.fixed_step",
     "formulas": "mbkit.lagrangian.formulas",
     "freeing": "mbkit.model.changes.freeing",
-    "friction_step": "mbkit.simulate.solvers.friction.single_step",
+    "step_in_phases": "mbkit.simulate.solvers.in_phases.single_step",
     "locking": "mbkit.model.changes.locking",
     "sdf": "mbkit.engines.imported",
     "segments": "mbkit.model.changes.segments",

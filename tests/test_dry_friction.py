@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq, lsq_linear
 
 import mbkit as mb
-from mbkit.engines.elements.dry_friction import forces_at_rest
+from mbkit.engines.elements.jumps import forces_at_rest
 from mbkit.errors import InputError, MbkitWarning, ModelError, TorqueError
 from mbkit.lagrangian.printing.summary import SystemSummary, python_code
 from mbkit.model import Model
-from mbkit.model.changes.dry_friction import held_at_rest
+from mbkit.model.changes.jumps import held_at_rest
 from tests.random_trees import IN_MUJOCO, SOUND, off, random_tree, states
 
 EPS = float(np.finfo(float).eps)
@@ -468,7 +468,7 @@ def test_what_turns_in_moreau_s_step_is_held_by_its_stiction(
     numbers: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It once turned wherever the force at the turn was above the friction of motion."""
-    from mbkit.simulate.solvers.friction import moreau
+    from mbkit.simulate.solvers.in_phases import moreau
 
     friction, stiction, damping = numbers
     model = slider(friction=friction, stiction=stiction, damping=damping)
@@ -499,7 +499,7 @@ def test_a_last_step_of_moreau_that_is_shorter_is_so_in_machine_code() -> None:
 
 
 def test_what_lets_go_in_moreau_s_step_has_the_friction_of_motion(monkeypatch: pytest.MonkeyPatch) -> None:
-    from mbkit.simulate.solvers.friction import moreau
+    from mbkit.simulate.solvers.in_phases import moreau
 
     dyn = mb.dynamics(slider(friction=3.0, stiction=5.0), "lagrangian", compile=True)
     pull = np.linspace(0, 20, 101)[:-1, None]
@@ -512,7 +512,7 @@ def test_what_lets_go_in_moreau_s_step_has_the_friction_of_motion(monkeypatch: p
 
 
 def test_moreau_s_step_in_machine_code_is_that_in_python(monkeypatch: pytest.MonkeyPatch) -> None:
-    from mbkit.simulate.solvers.friction import moreau
+    from mbkit.simulate.solvers.in_phases import moreau
 
     model = rubbed(3, 4, ("revolute", "universal", "prismatic", "spherical_zyx"), mimic=True)
     q, v, tau = mostly_at_rest(model, 2)

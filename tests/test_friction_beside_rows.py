@@ -421,7 +421,7 @@ def test_a_drive_that_begins_slowly_lets_its_pins_go_once() -> None:
 def test_phases_beside_a_drive_are_kept_for_their_time(engine: str) -> None:
     """A step of Moreau's asks for the same one each time, which otherwise chooses its rows again."""
     dyn, still = mb.dynamics(shaken(), engine), np.array([False, True])
-    law, later = dyn._friction, dyn.at(t=1.5)
+    law, later = dyn._jumps, dyn.at(t=1.5)
     phase = law.phase(dyn, np.zeros(2), still)
     assert law.phase(dyn, np.zeros(2), still) is phase
     assert law.phase(later, np.zeros(2), still).model.time == 1.5

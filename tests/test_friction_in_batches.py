@@ -13,7 +13,7 @@ import mbkit as mb
 from mbkit._check import EPS
 from mbkit.errors import InputError, MbkitWarning, ModelError
 from mbkit.model import Model
-from mbkit.simulate.solvers.friction.fixed import first_zero
+from mbkit.simulate.solvers.in_phases.fixed import first_zero
 from tests.random_trees import off
 from tests.test_dry_friction import mostly_at_rest, rubbed
 

@@ -104,7 +104,7 @@ def test_softness_is_warned_of_once_and_survives_copies() -> None:
         for dyn in (pickle.loads(pickle.dumps(soft(model))), soft(model).at()):
             assert (dyn.forward_dynamics(q, v, [0.1, 0.2]) == a).all()
     assert "FRICTIONLOSS" not in soft(model).disabled
-    assert not soft(mb.catalog.double_pendulum())._soft_friction
+    assert not soft(mb.catalog.double_pendulum())._soft_jumps
     with pytest.raises(InputError, match="soft_friction: expected True or False, got 2"):
         mb.dynamics(model, "mujoco", soft_friction=2)
 

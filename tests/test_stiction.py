@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit.engines.elements.dry_friction import friction_forces
+from mbkit.engines.elements.jumps import friction_forces
 from mbkit.model import Model
 from tests.random_trees import off
 

@@ -82,7 +82,7 @@ def derive(
     from mbkit.lagrangian.energy_model import EnergyModel
     from mbkit.lagrangian.from_description import from_model
     from mbkit.lagrangian.printing.catalog_symbols import in_symbols, letters
-    from mbkit.model.changes.dry_friction import held_at_rest
+    from mbkit.model.changes.jumps import held_at_rest
     from mbkit.simulate.progress import Bar
 
     on_paper = isinstance(target, EnergyModel)

@@ -24,7 +24,7 @@ from mbkit.derivation import FUNCTIONS, equations_of
 from mbkit.derivation.body_motion import OF_FRAME, OF_WHOLE
 from mbkit.errors import InputError, OutputError, UnsupportedError, require_known
 from mbkit.model import Model
-from mbkit.model.changes.dry_friction import held_at_rest
+from mbkit.model.changes.jumps import held_at_rest
 from mbkit.model.elements import paths
 from mbkit.model.elements.kinds import kind
 from mbkit.model.quantities import QUANTITIES

@@ -15,7 +15,7 @@ import casadi as ca
 from mbkit.derivation import model_values
 from mbkit.derivation.model_values import Constants, Values, is_zero, scalar
 from mbkit.model import GravityCompensation, Joint, JointCoupling, Model
-from mbkit.model.changes.dry_friction import FrictionNumbers, friction_bindings
+from mbkit.model.changes.jumps import JumpNumbers, jump_bindings
 from mbkit.model.joint_types import cross3, dot3
 from mbkit.model.parts import PointSpring
 
@@ -324,17 +324,17 @@ def dissipation(kin: Kinematics) -> Any:
 
 
 def damping_forces(kin: Kinematics) -> Any:
-    """Return -∂R/∂v, and -f(|v|) sign(v) by the law of `mbkit.model.changes.dry_friction`, which is zero at rest."""
+    """Return -∂R/∂v, and -f(|v|) sign(v) by the law of `mbkit.model.changes.jumps`, which is zero at rest."""
     smooth = -ca.gradient(dissipation(kin), kin.v)
-    jumps = [ca.gradient(rate, kin.v) * (size * ca.sign(rate)) for rate, size in dry_friction(kin, ca.exp)]
+    jumps = [ca.gradient(rate, kin.v) * (size * ca.sign(rate)) for rate, size in jump_rates(kin, ca.exp)]
     return smooth - sum(jumps[1:], jumps[0]) if jumps else smooth
 
 
-def dry_friction(kin: Kinematics, exp: Callable[[Any], Any]) -> Iterator[tuple[Any, Any]]:
+def jump_rates(kin: Kinematics, exp: Callable[[Any], Any]) -> Iterator[tuple[Any, Any]]:
     """Yield the rate of each velocity with dry friction, and its f(|v|)."""
-    free = {(b.part, b.index[0]) for b in friction_bindings(kin.model)}
+    free = {(b.part, b.index[0]) for b in jump_bindings(kin.model)}
     for joint in kin.model.joints:
-        values, given = kin.values.of(joint), FrictionNumbers.of([joint])
+        values, given = kin.values.of(joint), JumpNumbers.of([joint])
         for k in range(joint.type.nv):
             if not (given.sliding[k] + given.bound[k] or (joint.name, k) in free):
                 continue

@@ -23,7 +23,7 @@ from mbkit.engines.closed_loops.actuation import ACTUATOR_FORCES
 from mbkit.engines.closed_loops.loop_loads import LOOP_LOADS
 from mbkit.engines.closed_loops.reduced_inertia import REDUCED_INERTIA, IndependentMotion
 from mbkit.engines.elements.added_force import UNDER_FORCE
-from mbkit.engines.elements.dry_friction import DryFriction
+from mbkit.engines.elements.jumps import Jumps
 from mbkit.engines.frames_and_momenta import (
     ALIGNED,
     JOINT,
@@ -485,10 +485,10 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
     def _method(self, quantity: str) -> Callable[..., Any]:
         """Return the method for a quantity, with dry friction; raise `UnsupportedError` where there is none."""
         if quantity in OF_THE_WHOLE and self.model.rotors:
-            return self._matter._without_friction(quantity)
-        method = self._without_friction(quantity)
-        exact = "jump" in self.model.effects and not (self._soft_friction and quantity in UNDER_FORCE)
-        return self._friction.beside(quantity, method, self) if exact else method
+            return self._matter._without_jumps(quantity)
+        method = self._without_jumps(quantity)
+        exact = "jump" in self.model.effects and not (self._soft_jumps and quantity in UNDER_FORCE)
+        return self._jumps.beside(quantity, method, self) if exact else method
 
     def _of_sample(self, i: int) -> Dynamics:  # noqa: ARG002  # for the engine whose samples differ
         """Return the dynamics of one sample of a batch."""
@@ -508,11 +508,11 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         return self._of_model(self.model.without(*that_do("T")), "bodies alone")
 
     @cached_property
-    def _friction(self) -> DryFriction:
+    def _jumps(self) -> Jumps:
         """Dry friction of the model's joints."""
-        return DryFriction(self.model)
+        return Jumps(self.model)
 
-    def _without_friction(self, quantity: str) -> Callable[..., Any]:
+    def _without_jumps(self, quantity: str) -> Callable[..., Any]:
         """Return the adapter's method for a quantity; raise `UnsupportedError` where it has none."""
         group = TABLE[quantity].group if quantity in TABLE else ""
         if group in OF_BODIES:
@@ -635,7 +635,7 @@ class WrenchedDynamics(Dynamics):
 
     def __init__(self, dyn: Dynamics, frames: tuple[Frame, ...], axes: str) -> None:
         self._bare, self._acting, self._path = dyn, (frames, axes), dyn._path
-        self._soft_constraints, self._soft_friction = dyn._soft_constraints, dyn._soft_friction
+        self._soft_constraints, self._soft_jumps = dyn._soft_constraints, dyn._soft_jumps
         super().__init__(dyn.model)
         self._forward_dynamics = dyn._method("forward_dynamics")
         dyn._method("jacobian")

@@ -77,12 +77,12 @@ class Constrained(Evaluation):
 
     #: Whether the engine lets constraints give way: its states are those of its own equations, and none is projected.
     _soft_constraints: bool = False
-    #: Options with which the engine holds dry friction by its own soft law, and whether it does.
-    _soft_friction_options: ClassVar[Mapping[str, Any]] = {}
-    _soft_friction: bool = False
+    #: Options with which the engine has a soft law of its own for forces that jump, and whether it has.
+    _soft_jump_options: ClassVar[Mapping[str, Any]] = {}
+    _soft_jumps: bool = False
 
-    def _friction_beside_passive(self, q: Array, v: Array, tau: Array) -> Array:  # noqa: ARG002  # of a soft law
-        """Return the forces of dry friction in accelerations under τ, less those in `passive`; (N, nv)."""
+    def _jumps_beside_passive(self, q: Array, v: Array, tau: Array) -> Array:  # noqa: ARG002  # of a soft law
+        """Return the forces that jump in accelerations under τ, less those in `passive`; (N, nv)."""
         return np.zeros_like(v)
 
     @property
@@ -294,7 +294,7 @@ class Constrained(Evaluation):
         """Return the multipliers λ of all rows under the force τ, (m,) or (N, m).
 
         Where rows are redundant, λ is not unique: it is the one with the least norm, in N and N m. Jᵀ λ, which
-        `generalized_constraint_force` returns, is unique all the same. Joints that dry friction holds at rest beside
+        `generalized_constraint_force` returns, is unique all the same. Joints that are held at rest beside
         rows that let them move together alone share what they hold: neither is unique then, while the motion is.
 
         Examples
@@ -324,12 +324,12 @@ class Constrained(Evaluation):
         self._warn_if_inconsistent(q, v)
         out = self._evaluate(quantity, q=q, v=v, tau=tau)
         if "jump" in self.model.effects and self._projects:
-            self._friction.warn_of_shares(self, quantity, *(np.asarray(x) for x in (q, v, tau)))
+            self._jumps.warn_of_shares(self, quantity, *(np.asarray(x) for x in (q, v, tau)))
         return out
 
     def _generalized_constraint_force(self, q: Array, v: Array, tau: Array) -> Any:
-        # Dry friction is in τ already.
-        J, forces = self.constraint_jacobian(q), self._without_friction("constraint_forces")(q, v, tau)
+        # What holds joints at rest is in τ already.
+        J, forces = self.constraint_jacobian(q), self._without_jumps("constraint_forces")(q, v, tau)
         return (np.swapaxes(J, -1, -2) @ forces[..., None])[..., 0]
 
     def project(self, q: ArrayLike, v: ArrayLike, hold: Sequence[str] = ()) -> tuple[Array, Array]:

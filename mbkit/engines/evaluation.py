@@ -19,14 +19,14 @@ class Evaluation:
 
     engine: ClassVar[str]
     model: Model
-    _soft_friction: bool
+    _soft_jumps: bool
     _state_unchecked: bool
     _step_unchecked: bool
     # Checks, batches and methods of adapters stand in `Dynamics`.
     at: Callable[..., Any]
     _evaluate: Callable[..., Array]
     _method: Callable[[str], Evaluate]
-    _without_friction: Callable[[str], Evaluate]
+    _without_jumps: Callable[[str], Evaluate]
     _states: Callable[[dict[str, ArrayLike]], tuple[dict[str, Array], int | None]]
     _value: Callable[[Evaluate, list[Array], tuple[Any, ...], int | None], Any]
     _require_finite: Callable[[str, Array, dict[str, Array]], None]
@@ -63,7 +63,7 @@ class Evaluation:
     _centroidal_momentum: Callable[[Array, Array], Array]
     _joint_wrenches: Evaluate
     _row_choice: Any
-    _friction: Any
+    _jumps: Any
 
     @property
     def _samples(self) -> int | None:

@@ -164,9 +164,9 @@ class Steps(Evaluation):
             self._states_held.manifold_of(self).at(self.model.time).check(states["q"], states["v"])
         # An overflow is reported as an error.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            if "jump" in self.model.effects and not self._soft_friction:
-                # The phases of friction are those of runs, a floor above.
-                q1, v1 = from_above("friction_step").step(self, chosen, **states, dt=h)
+            if "jump" in self.model.effects and not self._soft_jumps:
+                # Phases are those of runs, a floor above.
+                q1, v1 = from_above("step_in_phases").step(self, chosen, **states, dt=h)
             else:
                 with unwatched(self):
                     q1, v1 = self._step(chosen, **states, dt=h)
@@ -295,7 +295,7 @@ def differentiable_method(model: Model, engine: str, name: object) -> Method:
     """Return the method of this name, if the derivative of its step is known."""
     STEP_DERIVATIVE.admit(model)
     method = method_of(name)
-    fixed = [m for m in METHODS.values() if m.kind == "fixed" and not m.dry_friction]
+    fixed = [m for m in METHODS.values() if m.kind == "fixed" and (m.formula or m.in_momenta)]
     known = [m.name for m in fixed if not m.engines or engine in m.engines]
     if method.name not in known:
         lacks = method.kind == "fixed" and f"{engine} {method.lacks}"

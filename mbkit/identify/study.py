@@ -21,7 +21,7 @@ from mbkit.identify.result import SIGNIFICANT_DEVIATIONS, Identification, Identi
 from mbkit.model import Model
 from mbkit.model.base_parameters import BASE_PARAMETERS, POWERS, length_of, standard_names
 from mbkit.model.builder import expect_model
-from mbkit.model.changes.dry_friction import DryFrictionLaw
+from mbkit.model.changes.jumps import JumpLaw
 from mbkit.model.elements.forces import GravityCompensation
 from mbkit.simulate.progress import Progress, ProgressFunction
 
@@ -144,7 +144,7 @@ def identify(
     rest = real("rest", rest, nonnegative=True)
     if rest >= 1:
         raise InputError(f"rest: expected a part of the greatest speed below 1, got {rest:g}")
-    dry = np.full(model.nv, True) if friction else DryFrictionLaw(model).bound > 0
+    dry = np.full(model.nv, True) if friction else JumpLaw(model).bound > 0
     data = Measurements.of(model, q, v, a, tau, weights).moving(dry, rest)
     _require_enough(model, unknowns, data)
     with Progress(progress, "identify") as reported:

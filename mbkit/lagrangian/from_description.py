@@ -10,7 +10,7 @@ from typing import Final, cast
 import sympy as sp
 
 from mbkit._warn import warn
-from mbkit.derivation.kinematics import dissipation, dry_friction, spring_energy
+from mbkit.derivation.kinematics import dissipation, jump_rates, spring_energy
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 from mbkit.lagrangian.description_kinematics import INSTEAD_OF_WRITING, SymbolicKinematics, exact, written_rows
 from mbkit.lagrangian.elements import acting, law
@@ -20,7 +20,7 @@ from mbkit.lagrangian.printing.catalog_symbols import in_symbols
 from mbkit.lagrangian.system import Lagrangian, QuasiLagrangian
 from mbkit.lagrangian.trig.simplify import tidy
 from mbkit.model import Joint, Model
-from mbkit.model.changes.dry_friction import held_at_rest
+from mbkit.model.changes.jumps import held_at_rest
 from mbkit.model.elements.beams import BeamEnd
 from mbkit.model.elements.motion_laws import MOTION_LAWS, motions_of
 from mbkit.model.elements.paths import ALL, Path
@@ -144,7 +144,7 @@ def from_model(
         moved = {}
     put = {q[i]: x for i, x in moved.items()} | {v[i]: sp.diff(x, t) for i, x in moved.items()}
     stored, pushed = acting(kin, t)
-    for rate, size in dry_friction(kin.written, sp.exp):
+    for rate, size in jump_rates(kin.written, sp.exp):
         pushed = [x - size * sp.sign(rate) * sp.diff(rate, w) for x, w in zip(pushed, v, strict=True)]
     T, V, R, *constraints = (x.xreplace(put) for x in (T, V + stored, R, *(row for _, row in rows)))
     pushed, moving = ([x.xreplace(put) for x in found] for found in (pushed, moving))

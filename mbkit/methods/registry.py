@@ -266,7 +266,7 @@ METHODS: Final[dict[str, Method]] = {
             stability=SYMPLECTIC_EULER,
             dry_friction=True,
             compiled=True,
-            solver="friction.moreau:run_moreau",
+            solver="in_phases.moreau:run_moreau",
         ),
         _adaptive(
             ADAPTIVE_METHOD, 8, "adaptive:run_embedded", stages=12, formula_source=dormand_prince_853, compiled=True

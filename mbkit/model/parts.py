@@ -17,13 +17,19 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike
 
-from mbkit._check import PRINTED, Array, finite_array, shown
+from mbkit._check import EPS, PRINTED, Array, finite_array, shown
 from mbkit.errors import ModelError
 from mbkit.model.joint_types import JointType, kind_of, register_joint_type
 
 #: Armature of a joint that rests, kg m² or kg: what accelerates it is smaller than any rounding, and articulated
 #: inertias beside it are those of a fixed joint to the last bit.
 RESTING: Final = 1e30
+#: A force at rest is above its bound where it is so by more than this part, as rounding of its sums may be.
+ROUNDING: Final = 1e-13
+#: Velocities that follow from others by rows, relative to these, that are rounding of a pose.
+POSE_ROUNDING: Final = 1e-9
+#: Speed, m/s or rad/s, of what has stopped: below every rounding, and above what a drive that has ended leaves.
+STOPPED: Final = EPS**2
 _ONE: Final = np.eye(3)
 
 

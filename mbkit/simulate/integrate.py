@@ -196,18 +196,18 @@ def _outcome(problem: IntegrationProblem, method: Method) -> SolverResult:
         # Where nothing moves, other methods have no scale and no series.
         method = METHODS[ADAPTIVE_METHOD]
     problem = replace(problem, method=method.name)
-    if dyn._soft_friction and method.dry_friction:
+    if dyn._soft_jumps and method.dry_friction:
         raise UnsupportedError(
             f"{method.name}: solves exact dry friction, and {dyn.engine} was asked for its own; leave soft_friction out"
         )
     native = method.kind == "native"
-    if not dyn._soft_friction and (native or not (method.events or problem.equal_steps)):
-        own = ", ".join(f"{name}={value}" for name, value in dyn._soft_friction_options.items() if native)
+    if not dyn._soft_jumps and (native or not (method.events or problem.equal_steps)):
+        own = ", ".join(f"{name}={value}" for name, value in dyn._soft_jump_options.items() if native)
         soft = (
             f" (mbkit.dynamics(model, {dyn.engine!r}, {own}) has dry friction of its own, which is soft)" if own else ""
         )
         SMOOTH_RUNS.admit(dyn.model, f"{method.name}{soft}: not known of")
-    elif not dyn._soft_friction:
+    elif not dyn._soft_jumps:
         RUNS.admit(dyn.model)
     if method.dry_friction:
         return _solver(dyn, method, read)(problem)
@@ -215,9 +215,9 @@ def _outcome(problem: IntegrationProblem, method: Method) -> SolverResult:
     def solver(smooth: Dynamics) -> Callable[[IntegrationProblem], SolverResult]:
         return lambda part: along_constraints(smooth, _solver(smooth, method, read)(part))
 
-    if "jump" not in dyn.model.effects or dyn._soft_friction:
+    if "jump" not in dyn.model.effects or dyn._soft_jumps:
         return solver(dyn)(problem)
-    from mbkit.simulate.solvers.friction.runs import run_in_phases
+    from mbkit.simulate.solvers.in_phases.runs import run_in_phases
 
     return run_in_phases(problem, solver)
 

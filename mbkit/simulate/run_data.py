@@ -172,7 +172,7 @@ class RunData:
             else:
                 held = np.zeros(self._numbers) if force is None else force.between(t)
                 steps = _of_held(dyn, np.diff(t), q, v, held, self._acting)
-        if "jump" in self.model.effects and not dyn._soft_friction:
+        if "jump" in self.model.effects and not dyn._soft_jumps:
             steps = steps - self._rubbed(dyn)
         out = np.zeros(q.shape[:-1])
         np.cumsum(steps, axis=-1, out=out[..., 1:])
@@ -180,10 +180,10 @@ class RunData:
 
     def _by_phases(self, dyn: Dynamics, power: Array) -> Array:
         """Return the integral of a power over each interval; no cubic goes across the end of a phase."""
-        if "jump" not in self.model.effects or dyn._soft_friction or not self.events:
+        if "jump" not in self.model.effects or dyn._soft_jumps or not self.events:
             return _by_cubics(self.t, power)
         rows = power.reshape(-1, len(self.t))
-        out, which = np.zeros((len(rows), len(self.t) - 1)), dyn._friction.law.which
+        out, which = np.zeros((len(rows), len(self.t) - 1)), dyn._jumps.law.which
         for i, row in enumerate(rows):
             # Phases end where a velocity with friction is zero; other events part nothing.
             ends = [x.t for x in self.events if x.member in (None, i) and (x.v[which] == 0).any()]
@@ -205,7 +205,7 @@ class RunData:
             speeds = np.concatenate([v[i], *(x.v[None] for x in hits)])[order]
             moved = np.zeros((max(len(times) - 1, 0), v.shape[-1]))
             moved[:, plain] = np.diff(np.concatenate([q[i], *(x.q[None] for x in hits)])[order][:, coordinates], axis=0)
-            law = dyn._friction.law_of(dyn._of_sample(i))
+            law = dyn._jumps.law_of(dyn._of_sample(i))
             taken = np.append(0.0, np.cumsum(law.dissipated(np.diff(times[order]), moved, speeds)))
             out[i] = np.diff(taken[np.argsort(order)[: len(t)]])
         return out.reshape(*self.q.shape[:-2], -1)
@@ -310,9 +310,9 @@ def _of_held(dyn: Dynamics, h: Array, q: Array, v: Array, held: Array, acting: A
     pushed, wrenches = held[..., :nv], held[..., nv:]
     coordinates, plain = np.array(_plain(dyn.model), dtype=int).reshape(-1, 2).T
     model = dyn.model
-    lossy = dyn._soft_friction or model.needs.damping or model.forces or not model.has_bodies or _driven(dyn)
+    lossy = dyn._soft_jumps or model.needs.damping or model.forces or not model.has_bodies or _driven(dyn)
     losing, turned = bool(lossy or wrenches.any()), len(plain) < nv and bool(pushed.any())
-    moved, jumps = np.diff(q, axis=-2)[..., coordinates], "jump" in model.effects and not dyn._soft_friction
+    moved, jumps = np.diff(q, axis=-2)[..., coordinates], "jump" in model.effects and not dyn._soft_jumps
     # Forces that jump keep their sides up to the states in which they change them, and what rests is held up to there.
     sides, keeps = np.zeros(pushed.shape), np.zeros(pushed.shape, dtype=bool)
     sides[..., plain], keeps[..., plain] = np.sign(moved), jumps
@@ -412,8 +412,8 @@ def _lost_power(dyn: Dynamics, q: Array, v: Array, tau: Array) -> Array:
     if model.needs.damping:
         # At rest the passive force is that of springs; forces by functions are counted above.
         force = force + _dampers(dyn, q, v) - _dampers(dyn, q, np.zeros_like(v))
-    if dyn._soft_friction:
-        force = force + dyn._friction.law_of(dyn).force(v) + dyn._friction_beside_passive(q, v, tau)
+    if dyn._soft_jumps:
+        force = force + dyn._jumps.law_of(dyn).force(v) + dyn._jumps_beside_passive(q, v, tau)
     if _driven(dyn):
         force = force + dyn.generalized_constraint_force(q, v, tau)
     return np.asarray(np.sum(force * v, axis=-1))
@@ -422,7 +422,7 @@ def _lost_power(dyn: Dynamics, q: Array, v: Array, tau: Array) -> Array:
 def _dampers(dyn: Dynamics, q: Array, v: Array) -> Array:
     """Return the passive force of springs and dampers alone."""
     own = dyn.passive(q, v) - dyn._lost_force(q, v)
-    return np.asarray(own - dyn._friction.law_of(dyn).force(v) if "jump" in dyn.model.effects else own)
+    return np.asarray(own - dyn._jumps.law_of(dyn).force(v) if "jump" in dyn.model.effects else own)
 
 
 def _plain(model: Model) -> list[tuple[int, int]]:

@@ -19,8 +19,7 @@ from mbkit.derivation.equations import Equations
 from mbkit.derivation.steps.fixed import Part, function_of
 from mbkit.derivation.steps.rest import holding
 from mbkit.derivation.steps.symbols import SymbolicSpace, choose
-from mbkit.model.changes.dry_friction import ROUNDING
-from mbkit.model.parts import RESTING
+from mbkit.model.parts import RESTING, ROUNDING
 
 #: A round reads these and writes the same names with a 1 behind. `side` and `still` are of the velocities whose
 #: forces jump; `k` is the number of steps so far, `end` that to make; `best` is the least number of failures so far and

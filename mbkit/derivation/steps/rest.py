@@ -1,4 +1,4 @@
-"""Forces of friction on joints that rest, as expressions of a model whose joints slide or rest as parameters say."""
+"""Forces that hold joints at rest, as expressions of a model whose joints slide or rest as parameters say."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import numpy as np
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.steps.fixed import Part, function_of
 from mbkit.derivation.steps.symbols import SymbolicSpace, choose
-from mbkit.model.changes.dry_friction import POSE_ROUNDING, ROUNDING, STOPPED
-from mbkit.model.parts import RESTING
+from mbkit.model.parts import POSE_ROUNDING, RESTING, ROUNDING, STOPPED
 
 
 def holding(equations: Equations, q: Any, v: Any, a: Any, force: Any, parameters: Any) -> Any:

@@ -32,7 +32,7 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import Array, real, rows
 from mbkit._reproducible import DEPENDENT
-from mbkit.engines.elements.dry_friction import forces_at_rest
+from mbkit.engines.elements.jumps import forces_at_rest
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.model import Model
 

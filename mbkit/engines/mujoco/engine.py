@@ -96,7 +96,7 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         "and generalized_constraint_force(q, v, tau) is Jᵀ λ",
     }
     softness = Softness()
-    _soft_friction_options: ClassVar[dict[str, Any]] = {"soft_friction": True}
+    _soft_jump_options: ClassVar[dict[str, Any]] = {"soft_friction": True}
 
     def __init__(
         self,
@@ -109,18 +109,18 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         if not isinstance(soft_friction, (bool, np.bool_)):
             raise InputError(f"soft_friction: expected True or False, got {shown(soft_friction)}")
         # Without friction there is nothing to hold.
-        self._soft_friction = bool(soft_friction) and "jump" in model.effects
-        self._path = FRICTION_LOSS if self._soft_friction else MUJOCO
+        self._soft_jumps = bool(soft_friction) and "jump" in model.effects
+        self._path = FRICTION_LOSS if self._soft_jumps else MUJOCO
         super().__init__(model)
         self.softness = Softness.of(solref, solimp)
-        self._hold(build(model, softness=self.softness, soft_friction=self._soft_friction))
+        self._hold(build(model, softness=self.softness, soft_friction=self._soft_jumps))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuilt, (type(self), self.model, self.softness, self._soft_friction)
+        return _rebuilt, (type(self), self.model, self.softness, self._soft_jumps)
 
     def at(self, /, **values: Any) -> MujocoDynamics:
         return self._at_time(values) or _rebuilt(
-            type(self), self.model.with_nominal(single_values(values)), self.softness, self._soft_friction
+            type(self), self.model.with_nominal(single_values(values)), self.softness, self._soft_jumps
         )
 
     def _hold(self, compiled: MujocoModel) -> None:
@@ -136,7 +136,7 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         self._d = mujoco.MjData(self._m)
         # Model and data with what is soft; all terms but the accelerations are those of the tree.
         self._closed = self._m, self._d
-        if self.model.needs.loops or self._soft_friction:
+        if self.model.needs.loops or self._soft_jumps:
             self._m = copy.copy(self._m)
             self._m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
             self._d = mujoco.MjData(self._m)
@@ -233,14 +233,14 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         >>> 0 < said.digits < 3
         True
         """
-        if not self._soft_friction:
+        if not self._soft_jumps:
             CONSTRAINT_LAW.admit(self.model)
         q, v, tau = self.model.check_q(q), self.model.check_v(v), self.model.check_v(tau, "tau")
         if q.ndim > 1 or v.ndim > 1 or tau.ndim > 1:
             raise InputError(f"constraint_law: expected one state, got shapes {q.shape}, {v.shape}, {tau.shape}")
         pushed: Array = tau + self._elements.force(self, q, v) if self.model.forces else tau
         with self._lock, heard_warnings():
-            if "jump" in self.model.effects and not self._soft_friction:
+            if "jump" in self.model.effects and not self._soft_jumps:
                 _, pushed = self._exact_friction(q, v, pushed, self._forward_dynamics)
             with self._with_loops():
                 b = self._set(q, v)
@@ -255,14 +255,14 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
             forces.append(tau)
             return own(q, v, tau)
 
-        out = self._friction.beside("forward_dynamics", method, self)(q, v, tau)
+        out = self._jumps.beside("forward_dynamics", method, self)(q, v, tau)
         return np.asarray(out), forces[-1]
 
-    def _friction_beside_passive(self, q: Array, v: Array, tau: Array) -> Array:
-        if not self._soft_friction:
-            return super()._friction_beside_passive(q, v, tau)
+    def _jumps_beside_passive(self, q: Array, v: Array, tau: Array) -> Array:
+        if not self._soft_jumps:
+            return super()._jumps_beside_passive(q, v, tau)
         laws = [self.constraint_law(*state) for state in zip(q, v, tau, strict=True)]
-        return np.array([x.jacobian.T @ x.force for x in laws]) - self._friction.law.force(v)
+        return np.array([x.jacobian.T @ x.force for x in laws]) - self._jumps.law.force(v)
 
     def _smooth_acceleration(self, q: Array, v: Array, tau: Array) -> Array:
         """Return the accelerations without any constraint."""
@@ -376,7 +376,7 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
             b = self._set(q, v)
             self._accelerated(tau)
             out = self._directed(self._force(self._d.qacc - b))
-            if self.model.needs.loops or self._soft_friction:
+            if self.model.needs.loops or self._soft_jumps:
                 self._warn_of_softness(b, q, v, tau)
             return out
 
@@ -389,7 +389,7 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         with contextlib.suppress(np.linalg.LinAlgError):
             error = self._law(b, q, v, tau).error
             _TOLD.add(key)
-            what, rigid = ("dry friction", "exact friction") if self._soft_friction else ("loops", "rigid loops")
+            what, rigid = ("dry friction", "exact friction") if self._soft_jumps else ("loops", "rigid loops")
             warn(
                 f"{self.model.name}: MuJoCo holds {what} by soft constraints: its accelerations are "
                 f"{off_by(error, f'those of {rigid}')} at this state; constraint_law(q, v, tau).digits tells it of any "
@@ -400,9 +400,9 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
     def _law(self, b: Array, q: Array, v: Array, tau: Array) -> ConstraintLaw:
         """Return the law at the state that is in, where τ acts; what that is matters to exact friction alone."""
         M = full_mass_matrix(self._m, self._d)
-        own = friction_law if self._soft_friction else law
+        own = friction_law if self._soft_jumps else law
         out = own(self._m, self._d, M, self.softness, lambda a: self._force(a - b), self._columns)
-        if not self._soft_friction:
+        if not self._soft_jumps:
             return out
         return replace(out, rigid=self._exact_friction(q, v, tau, self._smooth_acceleration)[0])
 
@@ -461,7 +461,7 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
             For what MuJoCo does not hold: mimic joints, forces by functions and exact dry friction, and forces on a
             free joint's translation, which MuJoCo holds in world axes.
         """
-        MUJOCO_RUNS.admit(self.model.smooth if self._soft_friction else self.model)
+        MUJOCO_RUNS.admit(self.model.smooth if self._soft_jumps else self.model)
         q0, v0 = self.model.check_q(q0, "q0"), self.model.check_v(v0, "v0")
         size = batch_of(q0=q0, v0=v0)
         if size is not None:
@@ -475,7 +475,7 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         self._require_loops_that_meet()
         model = copy.copy(self.mj_model)
         model.body_gravcomp[:], model.jnt_stiffness[:] = self._own_forces
-        if (self.model.needs.loops or self._soft_friction) and 0 < self.softness.solref[0] < 2 * dt:
+        if (self.model.needs.loops or self._soft_jumps) and 0 < self.softness.solref[0] < 2 * dt:
             warn(
                 f"{self.model.name}: MuJoCo raises the time constant of its constraints from "
                 f"{self.softness.solref[0]:g} s to two steps, {2 * dt:g} s",

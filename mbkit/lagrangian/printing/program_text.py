@@ -55,7 +55,7 @@ class ProgramText(Printable):
     results : sympy.Matrix
         The quantity, in named terms.
     note : str
-        Friction at rest, which no term holds, and where constraints hold; empty without both.
+        What holds joints at rest in no term, and where constraints hold; empty without both.
     """
 
     model: str

@@ -151,9 +151,9 @@ def _rushes(dyn: Dynamics, method: Method, h: float, q: Array, v: Array) -> bool
 
 
 def softness(dyn: Dynamics, q: Array, v: Array) -> Iterator[str]:
-    """Yield how far MuJoCo's soft loops, or its soft friction, take accelerations off those of exact ones."""
+    """Yield how far an engine's soft constraints, or its soft law of jumps, take accelerations off exact ones."""
     law: Any = getattr(dyn, "constraint_law", None)
-    if law and (dyn._soft_friction or (dyn.model.needs.loops and dyn._soft_constraints)):
+    if law and (dyn._soft_jumps or (dyn.model.needs.loops and dyn._soft_constraints)):
         error = law(q, v, np.zeros(len(v))).error
         if error > ROUNDING:
             yield f"soft constraints: accelerations at the start are {off_by(error, 'those of exact ones')}"

@@ -52,7 +52,7 @@ class Comparison(ResultTable):
     `facts` has nq, nv, mass, digest, needs and notes of the model. `reference` is what the terms of all `engines` were
     measured by: the oracle. Accelerations of an engine with soft constraints are measured by its own written law
     instead, and `softness` has the digits that it keeps of the exact ones, at the median state. `findings` are what the
-    description has that no engine uses, its dry friction and its stiff joints. `precision` is the error against run
+    description has that no engine uses, its forces that jump and its stiff joints. `precision` is the error against run
     time of a few methods on a short horizon. `setup` has the seconds to build each engine; the derivation works when
     first called.
     `seconds` is the time of the whole study.

@@ -19,7 +19,6 @@ from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.registry import STANDARD, find_engine
 from mbkit.errors import KnownDefectWarning, MbkitError, NumericalError, UnsupportedError
 from mbkit.model import Model
-from mbkit.model.changes.dry_friction import DryFrictionLaw
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Progress, silent
@@ -83,7 +82,7 @@ class Judge:
                 self.forces = self.forces + np.abs(quantity(at.q, at.v))
         acting = np.abs(at.tau) + self.forces
         # Its size is told beside the other forces.
-        self.forces = self.forces - np.abs(DryFrictionLaw(model).force(at.v))
+        self.forces = self.forces - np.abs(oracle._jumps.law.force(at.v))
         gravity = float(np.linalg.norm(model.gravity))
         heavy = gravity * float(np.sqrt(model.mass)) if gravity else 0.0
         self.scales: Scales = Scales.of(oracle.mass_matrix(at.q), at.v, acting, heavy)
@@ -152,7 +151,7 @@ class Judge:
         for name, value in values.items():
             against, exact, rest = reference, high, low
             dyn = self.engines[name]
-            soft = dyn._soft_friction or (self.model.constrained and dyn._soft_constraints)
+            soft = dyn._soft_jumps or (self.model.constrained and dyn._soft_constraints)
             if soft and term.quantity in (OF_CONSTRAINED_MOTION if self.model.constrained else (FORWARD_DYNAMICS,)):
                 against, exact, rest = OWN_LAW, self._own_law(term, name), np.zeros_like(value)
             errors = term.errors((value - exact) - rest, exact, self.scales)
@@ -384,7 +383,7 @@ def _build(
             try:
                 # A few dozen states are no reason to compile; run times are.
                 options = {} if compile else find_engine(name).brief
-                own = find_engine(name).load()._soft_friction_options if "jump" in model.effects else {}
+                own = find_engine(name).load()._soft_jump_options if "jump" in model.effects else {}
                 try:
                     engines[name] = dynamics(model, name, **options, **own)
                 except UnsupportedError as error:

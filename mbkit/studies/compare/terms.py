@@ -183,7 +183,7 @@ def power_errors(dyn: Dynamics, oracle: OracleDynamics, at: States, scales: Scal
     # Forces without a potential do work at rest too; springs written as energies are in V.
     damping = dyn.passive(at.q, at.v) - dyn.passive(at.q, still)
     damping = damping + (dyn._lost_force(at.q, still) if model.has_bodies else dyn.passive(at.q, still))
-    damping = damping + dyn._friction_beside_passive(at.q, at.v, at.tau)
+    damping = damping + dyn._jumps_beside_passive(at.q, at.v, at.tau)
     inertial, rate = oracle.inverse_dynamics(at.q, at.v, a), oracle.energy_rate(at.q, at.v, a)
     # Drives do work, and so do constraints that give way.
     held = dyn.generalized_constraint_force(at.q, at.v, at.tau) if model.constrained else np.zeros_like(at.v)

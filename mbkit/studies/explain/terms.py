@@ -23,7 +23,7 @@ from mbkit.errors import (
     UnsupportedError,
 )
 from mbkit.model import Model
-from mbkit.model.changes.dry_friction import DryFrictionLaw, FrictionNumbers
+from mbkit.model.changes.jumps import JumpLaw, JumpNumbers
 from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.forces import coordinate_arguments
 from mbkit.model.elements.kinds import EFFECTS
@@ -138,11 +138,11 @@ def jump_gap(a: Model, b: Model) -> Gaps:
 
     Each velocity's is relative to its own.
     """
-    numbers = [FrictionNumbers.of(x.joints) for x in (a, b)]
+    numbers = [JumpNumbers.of(x.joints) for x in (a, b)]
     if all((x.bound == x.sliding).all() for x in numbers):
         return ()
     speeds = np.unique(np.concatenate([x.stribeck for x in numbers]))[:, None] * np.ones(a.nv)
-    ours, theirs = (np.vstack([law.bound, -law.force_at(speeds)]) for law in map(DryFrictionLaw, (a, b)))
+    ours, theirs = (np.vstack([law.bound, -law.force_at(speeds)]) for law in map(JumpLaw, (a, b)))
     size = np.maximum(ours, theirs).max(axis=0)
     apart = np.abs(ours - theirs).max(axis=0) / np.where(size > 0, size, 1.0)
     return (Gap(EFFECTS["jump"], float(apart.max()), a.velocity_joints[int(np.argmax(apart))]),)

@@ -30,7 +30,7 @@ from mbkit.load.mjcf import model_of_mjcf
 from mbkit.load.sanitized_text import Stripped, strip
 from mbkit.load.urdf_reader import urdf_links
 from mbkit.model import Model
-from mbkit.model.changes.dry_friction import DryFrictionLaw
+from mbkit.model.changes.jumps import JumpLaw
 from mbkit.model.elements.forces import by_functions
 from mbkit.model.model import unchecked
 from mbkit.model.validation import listing
@@ -192,7 +192,7 @@ def stages(
     if not lost:
         at = states_of(free, samples, seed)
         own = model_terms(free.smooth, at)
-        own["passive"] = own["passive"] + DryFrictionLaw(free).force(at.v)
+        own["passive"] = own["passive"] + JumpLaw(free).force(at.v)
         apart = gaps(own, _own_terms_of(free, imported, there, at), at, free)
     found = {
         g.term: Stage(g.term, g.relative <= tolerance, g.relative, g.joint, f"{g.relative:.1e} at {g.joint}")
@@ -229,7 +229,7 @@ def _own_terms_of(file: Model, imported: Imported, names: Mapping[str, str], at:
 def _terms(imported: Imported, at: States, without: tuple[str, ...] = ()) -> Values:
     """Return an importer's own terms with the forces that jump, which engines hold outside of their terms."""
     terms = imported.terms(at.q, at.v, without)
-    return _with(terms, {"passive": DryFrictionLaw(imported.model).force(at.v)})
+    return _with(terms, {"passive": JumpLaw(imported.model).force(at.v)})
 
 
 def own_terms(
@@ -283,7 +283,7 @@ def compare_parsers(
     An importer's ``explanation`` names each number that it reads otherwise than the file has it, as `explain` does of
     two descriptions. Its ``stages`` have what no description shows: M, g, nle and passive by joint name, by the engine
     itself on its own model, with all that it holds beside bodies and joints: flags, tendons, actuators at zero control,
-    fluid, gravity compensation; here passive holds the dry friction. And what is in no term: mimic joints, and the
+    fluid, gravity compensation; here passive holds the forces that jump. And what is in no term: mimic joints, and the
     loops and couplers of an MJCF, which decide nothing, as limits; the verdict names those that differ. Links that an
     importer fuses are fused on the other side too. Where mbkit does not read the file, nothing is compared: the
     importers that read it are only listed.

@@ -397,7 +397,7 @@ def reference(
         Increasing times within the duration, s; 0 is added if it is not among them.
     torque : array_like or callable, optional
         (nv,), held all the time; (K - 1, nv), held over each interval of `save`, which then runs from 0 to `duration`;
-        or a function of (t, q, v), for which only two engines make a reference, as for dry friction.
+        or a function of (t, q, v), for which only two engines make a reference, as for forces that jump.
     seconds : float
         Limit of the search's processor time, without derivation and compilation. The best reference by then is
         returned.

@@ -74,7 +74,7 @@ def work_precision(
     Parameters
     ----------
     model : Model
-        Without its dry friction, as a note says. Its mimic joints are free where MuJoCo's own integrators are among
+        Without forces that jump, as a note says. Its mimic joints are free where MuJoCo's own integrators are among
         the methods: MuJoCo would make them soft.
     engines : sequence of str
     methods : sequence of str, or mapping of str to sequence of str, optional

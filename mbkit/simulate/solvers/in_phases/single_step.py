@@ -1,4 +1,4 @@
-"""One step of an explicit method with dry friction, of one state or a batch."""
+"""One step of an explicit method with forces that jump, of one state or a batch."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from mbkit.methods.registry import Method
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.solvers.fixed_step import run_fixed
-from mbkit.simulate.solvers.friction.fixed import run_fixed_in_phases
-from mbkit.simulate.solvers.friction.phases import Friction
+from mbkit.simulate.solvers.in_phases.fixed import run_fixed_in_phases
+from mbkit.simulate.solvers.in_phases.phases import Phases
 from mbkit.simulate.time_grid import Grid
 from mbkit.simulate.torque import Torque
 
@@ -29,10 +29,10 @@ def step(dyn: Dynamics, method: Method, q: Array, v: Array, tau: Array, dt: floa
         return np.array([x for x, _ in each]).reshape(q.shape), np.array([x for _, x in each]).reshape(v.shape)
     clock = dyn.model.time_parameter
     start = 0.0 if clock is None else float(dyn.model.parameters[clock] or 0.0)
-    friction = Friction(dyn, side_by_side=together)
-    phase = friction.phase(start, q, v, tau)
-    q1, v1 = friction.held(phase.still, q, *phase.dyn.step(q, v, tau, dt, method.name, t=start))
-    over = (friction.margins(phase, start + dt, q1, v1, tau) < 0).any(axis=-1)
+    phases = Phases(dyn, side_by_side=together)
+    phase = phases.phase(start, q, v, tau)
+    q1, v1 = phases.held(phase.still, q, *phase.dyn.step(q, v, tau, dt, method.name, t=start))
+    over = (phases.margins(phase, start + dt, q1, v1, tau) < 0).any(axis=-1)
     if over.any():
         which: Any = np.flatnonzero(over) if together else ...
         own = dyn._of_samples(which) if together else dyn

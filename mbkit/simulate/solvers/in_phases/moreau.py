@@ -13,13 +13,13 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
-from mbkit.engines.elements.dry_friction import friction_forces
+from mbkit.engines.elements.jumps import friction_forces
 from mbkit.errors import FunctionError, NumericalError
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
 from mbkit.simulate.singular_poses import SingularPosesOfBatch
-from mbkit.simulate.solvers.friction.phases import Friction, applied, force_of, side_by_side
+from mbkit.simulate.solvers.in_phases.phases import Phases, applied, force_of, side_by_side
 from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.solvers.vector_field import DIVERGED
 from mbkit.simulate.time_grid import Indices
@@ -76,12 +76,12 @@ class _InPython:
     ) -> None:
         self._problem, self._dyn, self._record, self._members = problem, dyn, record, members
         self._force = None if side_by_side else problem.torque.of_member(problem.member(int(members[0])))
-        self._friction, self._space = Friction(dyn, side_by_side=side_by_side), Space(dyn.model)
+        self._phases, self._space = Phases(dyn, side_by_side=side_by_side), Space(dyn.model)
         none = np.zeros((len(members), dyn.model.nv))
-        self._law = dyn._friction.law_of(dyn)
+        self._law = dyn._jumps.law_of(dyn)
         self._rubs = np.broadcast_to(self._law.bound > 0, none.shape)
         # Without friction: neither a side nor rest.
-        self._smooth = self._friction.given(none, none > 0, none > 0, dyn).dyn if self._rubs.any() else dyn
+        self._smooth = self._phases.given(none, none > 0, none > 0, dyn).dyn if self._rubs.any() else dyn
         self._poses: SingularPosesOfBatch | None = None
         if dyn._projects:
             self._poses = SingularPosesOfBatch(problem.dyn, problem.start, problem.q, members.tolist())
@@ -114,7 +114,7 @@ class _InPython:
     def _step(self, t: float, h: float, q: Array, v: Array, force: Any) -> tuple[Array, Array]:
         dyn, space, bound = at_time(self._smooth, t), self._space, self._dyn.model.constrained
         smooth = v + h * dyn.forward_dynamics(q, v, applied(force, t, q, v))
-        inverse = self._dyn._friction.responses(dyn, q)
+        inverse = self._dyn._jumps.responses(dyn, q)
         if bound:
             # Rows hold velocities, not their rates: else no velocities of what rests together may be zero.
             own, M = at_time(dyn, t + h), (dyn._bare or dyn).mass_matrix(q)
@@ -137,7 +137,7 @@ class _InPython:
                     break
                 rests = rests | turns
         q1 = space.retract(q, h * space.to_integrator_velocity(q, free))
-        return self._friction.onto_rows(t + h, holds, q, q1, free) if bound else (q1, free)
+        return self._phases.onto_rows(t + h, holds, q, q1, free) if bound else (q1, free)
 
 
 class _Compiled:
@@ -151,10 +151,10 @@ class _Compiled:
         from mbkit.derivation.steps.moreau import MANY, PATIENCE, STATE, moreau_parts
 
         self._problem, self._record, self._i = problem, record, int(members[0])
-        friction, sliding = Friction(dyn), dyn._friction.sliding
+        phases, sliding = Phases(dyn), dyn._jumps.sliding
         self._force, self._space = problem.torque.of_member(problem.member(self._i)), Space(dyn.model)
         none = np.zeros(dyn.model.nv)
-        own: Any = dyn._friction.phase(dyn, none, none > 0)
+        own: Any = dyn._jumps.phase(dyn, none, none > 0)
         names = own.model.parameters
         which, sides, locks = sliding.which.tolist(), [*sliding.sides.values()], [*sliding.locks.values()]
         kept: dict[str, Any] = own.equations.kept
@@ -164,7 +164,7 @@ class _Compiled:
             )
         self._arena = arena = Arena(kept[problem.method], STATE)
         self._clock: int | None = None
-        arena["bound"][:] = dyn._friction.law_of(dyn).bound[which, None]
+        arena["bound"][:] = dyn._jumps.law_of(dyn).bound[which, None]
         if "parameters" in arena.code.rows:
             others = {name: x for name, x in names.items() if name not in {*sides, *locks}}
             arena["parameters"][:] = np.array([*others.values()], dtype=float)[:, None]
@@ -172,7 +172,7 @@ class _Compiled:
         self._now, self._at = arena.state, arena.at
         q, w = problem.q[self._i], self._space.to_integrator_velocity(problem.q[self._i], problem.v[self._i])
         self._put(q=q, w=w, best=MANY, left=PATIENCE, go=1.0)
-        self._friction, self._which = friction, which
+        self._phases, self._which = phases, which
         self._log = aligned(_ROUNDS * self._now.size).reshape(_ROUNDS, *self._now.shape)
         self._most = _PATIENCE * (len(which) + 1)
 
@@ -194,7 +194,7 @@ class _Compiled:
                 self.error = error
                 return k, attempts, str(error)
             if not k:
-                phase = self._friction.phase(grid.start, q, v, self._force(0))
+                phase = self._phases.phase(grid.start, q, v, self._force(0))
                 self._put(side=phase.sides[self._which], still=phase.still[self._which].astype(float))
             last = k + 1 if held or k == grid.steps - 1 else grid.steps - (grid.step(grid.steps - 1) != grid.dt)
             self._arena["tau"][:] = np.asarray(self._force(k))[:, None]

@@ -1,6 +1,6 @@
-"""Rest beside constraint rows: what rests with what, and how friction shares the forces that hold it.
+"""Rest beside constraint rows: what rests with what, and how joints share the forces that hold it.
 
-The rows allow velocities v = N u. Joints rest by friction in as many independent ways as their rows of N have; the
+The rows allow velocities v = N u. Joints rest in as many independent ways as their rows of N have; the
 others that rest follow from these. Forces λ hold them where Nᵀ λ is the force that is needed along N, and with more
 joints than ways λ is not unique. All stay at rest as long as some λ is within all bounds. The λ here is the one whose
 largest part of a bound is least, so that this part passes 1 where they let go.
@@ -16,9 +16,10 @@ from scipy.sparse.csgraph import connected_components
 
 from mbkit._check import EPS, Array
 from mbkit._reproducible import pivoted
-from mbkit.engines.elements.dry_friction import Mask
+from mbkit.engines.elements.jumps import Mask
 from mbkit.errors import NumericalError
-from mbkit.model.changes.dry_friction import POSE_ROUNDING
+from mbkit.model.elements.kinds import EFFECTS
+from mbkit.model.parts import POSE_ROUNDING
 
 #: Part of a motion that is left where it stops, by the rounding of late times; at a dead centre all of it is.
 _LEFT: Final = 1e-3
@@ -59,7 +60,7 @@ def stopped(N: Array, v: Array, rests: Mask, rubs: Mask) -> Array:
 
 
 def shares(N: Array, needed: Array, bound: Array, still: Mask, locked: Mask) -> Array:
-    """Return the forces of friction that give the `needed` ones along N, zero where nothing rests, (m, nv).
+    """Return the forces at joints that give the `needed` ones along N, zero where nothing rests, (m, nv).
 
     Parameters
     ----------
@@ -99,7 +100,7 @@ def _least(G: Array, needed: Array) -> Array:
     rows = np.column_stack([G.T / largest, np.zeros(d)])
     found = linprog(np.eye(n + 1)[n], box, np.zeros(2 * n), rows, needed / size, (None, None), options=exact)
     if found.x is None:
-        raise NumericalError(f"dry friction: what holds {n} joints at rest, of bounds that differ much, is not known")
+        raise NumericalError(f"{EFFECTS['jump']}: what holds {n} joints at rest is not known, as bounds differ much")
     # The dual is the motion in which they let go. It tells how each of them moves, however small its bound is.
     x, y = found.x[:n] * (size / largest), found.eqlin.marginals
     moves = G @ y

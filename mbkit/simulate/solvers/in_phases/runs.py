@@ -1,4 +1,4 @@
-"""Runs with dry friction by an adaptive method: phase after phase, each ended where something stops or lets go.
+"""Runs in phases by an adaptive method: phase after phase, each ended where something stops or lets go.
 
 The end of a phase is an event. Methods with a fixed step are in `fixed`.
 """
@@ -17,15 +17,15 @@ from mbkit.errors import FunctionError, NumericalError
 from mbkit.simulate.events import Followed, Hit
 from mbkit.simulate.problem import RUNS, IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.friction.fixed import MAX_EMPTY_PHASES, UNDECIDED, Solver, run_fixed_in_phases
-from mbkit.simulate.solvers.friction.phases import Friction, Phase
+from mbkit.simulate.solvers.in_phases.fixed import MAX_EMPTY_PHASES, UNDECIDED, Solver, run_fixed_in_phases
+from mbkit.simulate.solvers.in_phases.phases import Phase, Phases
 from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result, diverged
 
 _END: Final = "end of a phase"
 
 
 def run_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics], Solver]) -> SolverResult:
-    """Integrate a problem with dry friction; `solver` gives that of smooth dynamics."""
+    """Integrate a problem with forces that jump; `solver` gives that of smooth dynamics."""
     dyn = problem.dyn
     RUNS.admit(dyn.model)
     if problem.equal_steps is not None:
@@ -52,7 +52,7 @@ class _Member:
     def __init__(self, problem: IntegrationProblem, i: int, solver: Callable[[Dynamics], Solver]) -> None:
         self.problem, self.member, self._solver = problem, problem.member(i), solver
         dyn = problem.dyn if self.member is None else problem.dyn._of_sample(i)
-        self.friction = Friction(dyn)
+        self.phases = Phases(dyn)
         self.q, self.v = problem.q[i].copy(), problem.v[i].copy()
         self.force = problem.torque.of_member(self.member)
         # Parts look for the events, and for singular poses.
@@ -62,14 +62,14 @@ class _Member:
     def begin(self, k: int, t: float, leaving: Array | None = None) -> Phase:
         """Return the phase from here, with a torque that samples asked for its value."""
         self.problem.sample(self.member or 0, k, t, np.concatenate([self.q, self.v]))
-        return self.friction.phase(t, self.q, self.v, self.force(k), leaving)
+        return self.phases.phase(t, self.q, self.v, self.force(k), leaving)
 
     def solve(self, phase: Phase, k: int, **changes: object) -> SolverResult:
         """Solve the rest of the problem from here, with the force from row k on."""
         torque = self.problem.torque.of_part(self.member, k)
         own = replace(self.problem, dyn=phase.dyn, q0=self.q, v0=self.v, torque=torque, **changes)  # type: ignore[arg-type]
         result = self._solver(phase.dyn)(own)
-        q, v = self.friction.held(phase.still, self.q, result.q, result.v)
+        q, v = self.phases.held(phase.still, self.q, result.q, result.v)
         return replace(result, q=q, v=v)
 
     def next(self, phase: Phase, k: int, t: float, q: Array, v: Array, *, moved: bool) -> Phase | None:
@@ -77,8 +77,8 @@ class _Member:
 
         `moved` tells that time has passed.
         """
-        q, v = self.friction.held(phase.still, self.q, q, v)
-        v, leaving = self.friction.after(phase, t, q, v, self.force(k))
+        q, v = self.phases.held(phase.still, self.q, q, v)
+        v, leaving = self.phases.after(phase, t, q, v, self.force(k))
         self._stuck = 0 if moved else self._stuck + 1
         if self._stuck > MAX_EMPTY_PHASES:
             self.record.ended = "step_too_small"
@@ -87,7 +87,7 @@ class _Member:
         self.q, self.v = q, v
         # A joint that let go and came to rest at once did not let go.
         out = self.begin(k, t, leaving if moved else None)
-        for _, name in self.friction.changes(phase, out):
+        for _, name in self.phases.changes(phase, out):
             self.record.events.append(Hit(name, t, self.q.copy(), self.v.copy(), self.member))
         return out
 
@@ -101,7 +101,7 @@ def _adaptive(run: _Member) -> None:
     noise = max(1e-9, problem.tolerances.rtol)
     if rows is None or (len(rows) and rows[0] == t):
         record.keep(np.array([t]), run.q[None], run.v[None])
-    run.v = run.friction.stopped(run.friction.dyn, t, run.q, run.v, run.v == 0)
+    run.v = run.phases.stopped(run.phases.dyn, t, run.q, run.v, run.v == 0)
     phase: Phase | None = run.begin(0, t) if problem.duration else None
     while phase is not None and t < problem.end:
         own, begun = phase, t
@@ -111,7 +111,7 @@ def _adaptive(run: _Member) -> None:
                 # The solver tells that there is no state.
                 return 1.0
             row = run.force(max(k, int(np.searchsorted(stops, s, side="left"))))
-            out = float(run.friction.margins(own, s, q, v, row).min())
+            out = float(run.phases.margins(own, s, q, v, row).min())
             return max(out, EPS) if s == begun else out
 
         save = None if rows is None else np.append(rows[(rows > t) & (rows < problem.end)], problem.end)

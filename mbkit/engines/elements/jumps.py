@@ -26,8 +26,8 @@ from mbkit._warn import warn
 from mbkit.engines.elements.added_force import LOADS, UNDER_FORCE, AddedForce
 from mbkit.errors import MbkitWarning, NumericalError, UnsupportedError
 from mbkit.model import Model
-from mbkit.model.changes.dry_friction import POSE_ROUNDING, ROUNDING, DryFrictionLaw, Sliding, friction_bindings
-from mbkit.model.parts import RESTING
+from mbkit.model.changes.jumps import JumpLaw, Sliding, jump_bindings
+from mbkit.model.parts import POSE_ROUNDING, RESTING, ROUNDING
 
 #: Mask of the velocities at rest.
 Mask = NDArray[np.bool_]
@@ -162,11 +162,11 @@ def friction_forces(
     return forces, holds
 
 
-class DryFriction(AddedForce):
+class Jumps(AddedForce):
     """Dry friction of a model, for the quantities of an engine."""
 
     def __init__(self, model: Model) -> None:
-        self._model, self.law, self._varies = model, DryFrictionLaw(model), bool(friction_bindings(model))
+        self._model, self.law, self._varies = model, JumpLaw(model), bool(jump_bindings(model))
         self._constrained = model.constrained
         #: A model, and that whose joints slide, for `phases`.
         self._slid: tuple[Model, Model] | None = None
@@ -178,16 +178,14 @@ class DryFriction(AddedForce):
         by_v = self.law_of(dyn).slope(v)
         return np.zeros_like(by_v), by_v
 
-    def law_of(self, dyn: Any) -> DryFrictionLaw:
+    def law_of(self, dyn: Any) -> JumpLaw:
         """Return the law at the values of parameters of some dynamics of this model, or of each of their samples."""
         if not (self._varies and dyn._derived):
             return self.law
         held = vars(dyn)
         if "_law" not in held:
-            held["_law"] = DryFrictionLaw(
-                self._model, dict(zip(dyn.model.parameters, dyn._parameter_values.T, strict=True))
-            )
-        out: DryFrictionLaw = held["_law"]
+            held["_law"] = JumpLaw(self._model, dict(zip(dyn.model.parameters, dyn._parameter_values.T, strict=True)))
+        out: JumpLaw = held["_law"]
         return out
 
     def beside(self, quantity: str, method: Callable[..., Any], dyn: Any) -> Callable[..., Any]:
@@ -267,7 +265,7 @@ class DryFriction(AddedForce):
         accelerate = method
         if own is not dyn or not forward:
             name = quantity if forward else _FORWARD
-            accelerate = own._without_friction(name)
+            accelerate = own._without_jumps(name)
             accelerate = accelerate if own._has_force_elements else super().beside(name, accelerate, own)
         more = [x[rows] if isinstance(x, np.ndarray) else x for x in rest] if forward else []
         held, still = np.zeros(v.shape), np.zeros(v.shape, dtype=bool)
@@ -284,7 +282,7 @@ class DryFriction(AddedForce):
         tau: Array,
         resting: Mask,
         leaving: Array | None = None,
-        law: DryFrictionLaw | None = None,
+        law: JumpLaw | None = None,
     ) -> tuple[Array, Mask]:
         """Return the forces of friction at rest, and which joints stay at rest; (nv,) or (N, nv).
 
@@ -366,7 +364,7 @@ class DryFriction(AddedForce):
     ) -> Any:
         """Return a quantity of more digits than a double's, by the model whose joints slide or rest; (N, ...)."""
         moves = quantity.startswith(_FORWARD)
-        forward = dyn._without_friction(quantity if moves else _FORWARD)
+        forward = dyn._without_jumps(quantity if moves else _FORWARD)
 
         def one(i: int) -> Any:
             # Frames and axes of wrenches are those of all states.
@@ -378,7 +376,7 @@ class DryFriction(AddedForce):
 
             held, still = self.decided(dyn, accelerate, q[i], tau[i], resting[i])
             phase = self.phase(dyn, np.where(resting[i], -np.sign(held), np.sign(v[i])), still)
-            value = phase._without_friction(quantity)(*states, tau[i : i + 1], *more)
+            value = phase._without_jumps(quantity)(*states, tau[i : i + 1], *more)
             return value * phase._arithmetic.array(1.0 - still) if moves else value
 
         return np.concatenate([one(i) for i in range(len(v))])

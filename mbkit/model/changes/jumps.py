@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mbkit._check import EPS, Array
+from mbkit._check import Array
 from mbkit.model.elements.forces import JointForce
 from mbkit.model.elements.formula import written
 from mbkit.model.model import Model, unchecked
@@ -28,15 +28,9 @@ from mbkit.model.parts import RESTING, Joint, acting
 _ROTOR: Final = Joint.adding_to("T")[0]
 #: Numbers that may be parameters.
 _BOUND: Final = ("friction", "stiction")
-#: A force at rest is above its bound where it is so by more than this part, as rounding of its sums may be.
-ROUNDING: Final = 1e-13
-#: Velocities that follow from others by rows, relative to these, that are rounding of a pose.
-POSE_ROUNDING: Final = 1e-9
-#: Speed, m/s or rad/s, of what has stopped: below every rounding, and above what a drive that has ended leaves.
-STOPPED: Final = EPS**2
 
 
-class FrictionNumbers(NamedTuple):
+class JumpNumbers(NamedTuple):
     """Sliding friction, bound at rest and Stribeck velocity of each full velocity; (n,) each, and all zero without.
 
     Of samples with parameters of their own the first two are (N, n).
@@ -47,19 +41,19 @@ class FrictionNumbers(NamedTuple):
     stribeck: Array
 
     @classmethod
-    def of(cls, joints: Sequence[Joint]) -> FrictionNumbers:
+    def of(cls, joints: Sequence[Joint]) -> JumpNumbers:
         """Read them off joints, at nominal values of parameters."""
         none = np.zeros(0)
         fields = "friction", "stiction", "stribeck_velocity"
         return cls(*(np.concatenate([none, *(acting(j, field) for j in joints)]) for field in fields))
 
     @classmethod
-    def at_values(cls, model: Model, values: Mapping[str, Any]) -> FrictionNumbers:
+    def at_values(cls, model: Model, values: Mapping[str, Any]) -> JumpNumbers:
         """Return them at values of parameters, a number or (N,) each."""
         numbers, joints = cls.of(model.joints), {j.name: j for j in model.joints}
         size = np.broadcast_shapes(*(np.shape(x) for x in values.values()))
         sliding, bound = (np.array(np.broadcast_to(x, (*size, len(x)))) for x in numbers[:2])
-        for binding in friction_bindings(model):
+        for binding in jump_bindings(model):
             place = model.layout.full_v[binding.part].start + binding.index[0]
             value = binding.expression.evaluate(lambda p: values[p.name], float)
             if binding.field == "friction":
@@ -75,17 +69,17 @@ class FrictionNumbers(NamedTuple):
         return self.sliding + np.where(self.stribeck > 0, (self.bound - self.sliding) * fall, 0.0)
 
 
-def friction_bindings(model: Model) -> list[Binding]:
+def jump_bindings(model: Model) -> list[Binding]:
     """Return the numbers of dry friction that are expressions of parameters."""
     return [b for b in model.bindings if b.where == "joints" and b.field in _BOUND]
 
 
-class DryFrictionLaw:
+class JumpLaw:
     """The law of a model's friction by its independent velocities."""
 
     def __init__(self, model: Model, values: Mapping[str, Any] | None = None) -> None:
-        nominal = FrictionNumbers.of(model.joints)
-        self._numbers = nominal if values is None else FrictionNumbers.at_values(model, values)
+        nominal = JumpNumbers.of(model.joints)
+        self._numbers = nominal if values is None else JumpNumbers.at_values(model, values)
         self._G = model.layout.G if model.layout.reduced else None
         n = len(nominal.bound)
         sizes = np.abs(self._G) if self._G is not None else np.eye(n)
@@ -93,7 +87,7 @@ class DryFrictionLaw:
         self.bound: Array = self._numbers.bound @ sizes
         moving = self._numbers.at(np.zeros(n)) @ sizes
         may = nominal.bound != 0
-        for binding in friction_bindings(model):
+        for binding in jump_bindings(model):
             may[model.layout.full_v[binding.part].start + binding.index[0]] = True
         #: Velocities with friction, whatever parameters are.
         self.which = np.flatnonzero(may @ sizes)
@@ -142,7 +136,7 @@ class DryFrictionLaw:
 
 def held_at_rest(model: Model) -> str:
     """Return in words what f sign(v) leaves out at rest; empty without dry friction."""
-    bounds = zip(model.velocity_names, DryFrictionLaw(model).bound, strict=True)
+    bounds = zip(model.velocity_names, JumpLaw(model).bound, strict=True)
     held = " and ".join(f"{bound:g} at {name!r}" for name, bound in bounds if bound)
     return f"dry friction is f sign(v): zero at rest, where it can hold up to {held} (N or N m)" if held else ""
 
@@ -155,7 +149,7 @@ class Sliding:
     """
 
     def __init__(self, model: Model) -> None:
-        self.law = DryFrictionLaw(model)
+        self.law = JumpLaw(model)
         self.names = model.velocity_names
         #: Independent velocities with friction.
         self.which = self.law.which
@@ -179,9 +173,9 @@ class Sliding:
         return out
 
     def _of(self, model: Model) -> Model:
-        layout, numbers = model.layout, FrictionNumbers.of(model.joints)
+        layout, numbers = model.layout, JumpNumbers.of(model.joints)
         joints, forces, bindings = [], [], list[Binding]()
-        free = {(b.part, b.field, b.index[0]): b.expression for b in friction_bindings(model)}
+        free = {(b.part, b.field, b.index[0]): b.expression for b in jump_bindings(model)}
         for joint in model.joints:
             part = layout.full_v[joint.name]
             joints.append(replace(joint, friction=np.zeros(joint.type.nv), stiction=None, stribeck_velocity=None))
@@ -193,7 +187,7 @@ class Sliding:
             rows = [np.flatnonzero(layout.G[i])[0] for i in range(part.start, part.stop)]
             signs = [float(np.sign(layout.G[part.start + k, i])) for k, i in enumerate(rows)]
             own = [k for k, i in enumerate(rows) if int(i) in self.sides]
-            force, expressions = _force(name, joint, FrictionNumbers(*(x[part] for x in numbers)), signs, own_free)
+            force, expressions = _force(name, joint, JumpNumbers(*(x[part] for x in numbers)), signs, own_free)
             forces.append(force)
             bindings += [Binding("forces", name, "numbers", (k,), x) for k, x in expressions.items()]
             bindings += [
@@ -219,7 +213,7 @@ class Sliding:
 def _force(
     name: str,
     joint: Joint,
-    numbers: FrictionNumbers,
+    numbers: JumpNumbers,
     signs: Sequence[float],
     free: Mapping[tuple[str, int], Expression],
 ) -> tuple[JointForce, dict[int, Expression]]:

@@ -1,4 +1,4 @@
-"""Runs with dry friction by a method with a fixed step: trajectories side by side, each in a phase of its own.
+"""Runs in phases by a method with a fixed step: trajectories side by side, each in a phase of its own.
 
 All go blocks of steps by one solver, to whom the phase of each is a number. The margins of all states of a block are
 computed together. A trajectory whose phase ends in a block keeps its states up to there and takes the step in which it
@@ -15,16 +15,16 @@ import numpy as np
 
 from mbkit._check import EPS, Array
 from mbkit.engines import Dynamics
-from mbkit.engines.elements.dry_friction import Mask
+from mbkit.engines.elements.jumps import Mask
 from mbkit.errors import FunctionError, NumericalError
 from mbkit.methods.registry import method_of
-from mbkit.model.changes.dry_friction import STOPPED
 from mbkit.model.integration_space import Space
+from mbkit.model.parts import STOPPED
 from mbkit.simulate.events import Hit
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.result import Ended, SolverResult
-from mbkit.simulate.solvers.friction.phases import Friction, Phase, force_of, of_each, side_by_side
+from mbkit.simulate.solvers.in_phases.phases import Phase, Phases, force_of, of_each, side_by_side
 from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.time_grid import Grid, Indices
 
@@ -50,7 +50,7 @@ _TIMES: Final = 4 * EPS
 
 
 def run_fixed_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics], Solver]) -> SolverResult:
-    """Integrate a problem with dry friction on a grid; `solver` gives that of smooth dynamics.
+    """Integrate a problem with forces that jump on a grid; `solver` gives that of smooth dynamics.
 
     Torque functions, and engines whose parameters are not numbers, take the members of a batch one by one.
     """
@@ -96,7 +96,7 @@ class _Members:
         alone = None if side_by_side else problem.member(int(members[0]))
         self._alone = alone
         dyn = problem.dyn if alone is None else problem.dyn._of_sample(alone)
-        self.friction = Friction(dyn, side_by_side=side_by_side)
+        self.phases = Phases(dyn, side_by_side=side_by_side)
         self._timed = dyn.model.time_parameter is not None
         self._force = None if side_by_side else problem.torque.of_member(alone)
         self.q, self.v = problem.q[members].copy(), problem.v[members].copy()
@@ -119,8 +119,8 @@ class _Members:
             return
         rows, start = np.arange(len(self.k)), self.times(np.full(len(self.k), grid.start))
         self._sample(rows)
-        dyn = self.friction.dyn._of_samples(self.members) if self.side_by_side else self.friction.dyn
-        self.v = self.friction.stopped(dyn, start, self.q, self.v, self.v == 0)
+        dyn = self.phases.dyn._of_samples(self.members) if self.side_by_side else self.phases.dyn
+        self.v = self.phases.stopped(dyn, start, self.q, self.v, self.v == 0)
         self._phase = self.begin(rows, start)
         self._shortest = max(_BLOCK, _SET_UP // len(rows) if self._compiled(self._phase.dyn) else 0)
         self._window, parts = self._shortest, len(self.problem.q) // len(self.k)
@@ -152,27 +152,27 @@ class _Members:
         self, rows: Indices, phase: Phase, row: Indices, step: Indices, t: Array, q: Array, v: Array
     ) -> Array:
         """Return the margins of states in phases of rows, each behind one of the steps of a block."""
-        friction = self.friction
+        phases = self.phases
         if self._force is None:
             torque = self.problem.torque
             k = self.k[rows[row]] + step
             own: Any = torque.feedback or torque.rows(k[:, None], self.members[rows[row]])[:, 0]
-            return friction.margins(phase.take(row), t, q, v, own)
+            return phases.margins(phase.take(row), t, q, v, own)
         first = int(self.k[0])
         torque = self.problem.torque
         forces = None if torque.callable else torque.rows(first + step, self._alone)
         if forces is not None and (not self._timed or phase.dyn._takes_parameters):
-            return friction.margins(phase, t, q, v, forces)
+            return phases.margins(phase, t, q, v, forces)
         each = []
         for i, (j, when) in enumerate(zip(step.tolist(), t.tolist(), strict=True)):
             force: Any = of_each(self._force(first + j)) if forces is None else forces[i, None]
-            each.append(friction.margins(phase, when, q[i : i + 1], v[i : i + 1], force))
+            each.append(phases.margins(phase, when, q[i : i + 1], v[i : i + 1], force))
         return np.concatenate(each)
 
     def begin(self, rows: Indices, t: Any, leaving: Array | None = None) -> Phase:
         """Return the phases from here."""
         members = self.members[rows] if self.side_by_side else None
-        return self.friction.phase(t, self.q[rows], self.v[rows], self.forces(rows), leaving, members)
+        return self.phases.phase(t, self.q[rows], self.v[rows], self.forces(rows), leaving, members)
 
     def _keep(self, rows: Indices, k: Indices, count: Indices, q: Array, v: Array) -> None:
         """Put wanted states into the record: of (m, n + 1) behind k steps each row has so many, and one in front."""
@@ -230,7 +230,7 @@ class _Members:
         last = np.arange(len(rows)), good
         if phase.still.any():
             # What rests keeps its place and no velocity, to the bit.
-            np.copyto(q, q[:, :1].copy(), where=self.friction.places(phase.still)[:, None])
+            np.copyto(q, q[:, :1].copy(), where=self.phases.places(phase.still)[:, None])
             np.copyto(v, 0.0, where=phase.still[:, None])
         if not together:
             self._keep(rows, k, good, q, v)
@@ -264,7 +264,7 @@ class _Members:
     @cached_property
     def margin_part(self) -> Any:
         """The least margin, as a part behind a step."""
-        return self.friction.margin_part(self._phase.dyn)
+        return self.phases.margin_part(self._phase.dyn)
 
     def _margins_of(self, phase: Phase, t: Array, q: Array, v: Array) -> Array:
         """Return the least margins of the states of a block of one trajectory, (1, n)."""
@@ -274,7 +274,7 @@ class _Members:
         states = q, Space(dyn.model).to_integrator_velocity(q, v), force, np.zeros((1, 1))
         given = (
             np.broadcast_to(x, (len(q), np.shape(x)[1]))
-            for x in (*states, self.friction.bounds(phase), with_time(dyn, t))
+            for x in (*states, self.phases.bounds(phase), with_time(dyn, t))
         )
         return np.asarray(dyn._code(part.name, make=part.make)(*given, threads=dyn.threads)[0][:, 0, 0][None])
 
@@ -307,7 +307,7 @@ class _Members:
 
             more: dict[str, Any] = {}
             if margins is not None:
-                more = {"behind": [self.margin_part], "margins": margins, "bound": self.friction.bounds(phase)}
+                more = {"behind": [self.margin_part], "margins": margins, "bound": self.phases.bounds(phase)}
             out = run_rollout(own, record=GridRecord(own, *room), **more)
         self._record.count(out)
         self._record.doubts += out.doubts
@@ -326,7 +326,7 @@ class _Members:
     ) -> Indices:
         """Return how many states behind the first are of the phase, by their margins as far as these are known."""
         if margins is None:
-            margins = self.friction.speeds(phase, v[:, 1:]).min(axis=2, initial=1.0)
+            margins = self.phases.speeds(phase, v[:, 1:]).min(axis=2, initial=1.0)
             margins = np.where(phase.still.any(axis=1, keepdims=True) & (margins >= 0), np.nan, margins)
         good = _first(margins < 0, limit)
         row, step = np.nonzero(np.asarray(np.isnan(margins) & (np.arange(margins.shape[1]) < good[:, None])))
@@ -375,7 +375,7 @@ class _Members:
             if not decided.all():
                 rows, start, left = rows[decided], start[decided], left[decided]
                 phase = phase.take(np.flatnonzero(decided))
-        self._phase = self.friction.given(*self._phase.pattern, self._phase.rubbed)
+        self._phase = self.phases.given(*self._phase.pattern, self._phase.rubbed)
         whole = whole[self._going[whole]]
         self.k[whole] += 1
         record, k = self._record, self.k[whole]
@@ -398,7 +398,7 @@ class _Members:
 
         `moved` tells that time has passed, `pushed` that it has at least begun to.
         """
-        v, leaving = self.friction.after(before, self.times(t), *state, self.forces(rows))
+        v, leaving = self.phases.after(before, self.times(t), *state, self.forces(rows))
         self._empty[rows] = np.where(moved, 0, self._empty[rows] + 1)
         decided = self._empty[rows] <= MAX_EMPTY_PHASES
         self._going[rows] = decided
@@ -408,7 +408,7 @@ class _Members:
         self.q[rows], self.v[rows] = state[0], v
         # A joint that let go and came to rest at once did not let go.
         after = self.begin(rows, self.times(later), leaving * (moved | pushed)[:, None])
-        for i, name in self.friction.changes(before, after):
+        for i, name in self.phases.changes(before, after):
             if decided[i]:
                 row = rows[i]
                 at = float(t[i]), self.q[row].copy(), self.v[row].copy()
@@ -444,7 +444,7 @@ class _PartOfStep:
         timed = dyn.model.time_parameter
         if run._compiled(dyn):
             self._code, self._threads = dyn._step_with(run.problem.method, run.margin_part), dyn.threads
-            self._values, self._bound = with_time(dyn, t), run.friction.bounds(phase)
+            self._values, self._bound = with_time(dyn, t), run.phases.bounds(phase)
         self._stepped = self._method.explicit and timed is None and not callable(self._force)
 
     def ahead(self, i: Indices, s: Array) -> tuple[Array, Array, Array]:
@@ -456,7 +456,7 @@ class _PartOfStep:
             given = q, v, force, s[:, None], self._bound[i], self._values[i]
             arrays, finite = self._code.everything(*given, threads=self._threads)
             if finite:
-                return *run.friction.held(phase.still, q, arrays["q1"], arrays["v1"]), arrays["margins1"]
+                return *run.phases.held(phase.still, q, arrays["q1"], arrays["v1"]), arrays["margins1"]
         ends = q.copy(), v.copy()
         for j in np.flatnonzero(s > 0):
             own, one = phase.take(np.array([j])), slice(j, j + 1)
@@ -468,8 +468,8 @@ class _PartOfStep:
                 states = out.q, out.v
             for now, x in zip(ends, states, strict=True):
                 now[j] = x.reshape(-1, x.shape[-1])[-1]
-        margins = run.friction.margins(phase, run.times(self._t[i] + s), *ends, force)
-        return *run.friction.held(phase.still, q, *ends), margins
+        margins = run.phases.margins(phase, run.times(self._t[i] + s), *ends, force)
+        return *run.phases.held(phase.still, q, *ends), margins
 
     def ends(self, i: Indices, length: Array, over: Array) -> tuple[Array, Mask]:
         """Return after how many seconds phases end, before `length`, where margins are `over`; 0 if they do at once.

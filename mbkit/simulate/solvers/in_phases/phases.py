@@ -12,13 +12,12 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
-from mbkit.engines.elements.dry_friction import Mask
-from mbkit.model.changes.dry_friction import ROUNDING, STOPPED
+from mbkit.engines.elements.jumps import Mask
 from mbkit.model.elements.paths import ALL, Path
-from mbkit.model.parts import RESTING
+from mbkit.model.parts import RESTING, ROUNDING, STOPPED
 from mbkit.simulate.constraint_projection import settled
 from mbkit.simulate.problem import IntegrationProblem
-from mbkit.simulate.solvers.friction.beside_rows import fades, independent, shares, slow, stopped
+from mbkit.simulate.solvers.in_phases.beside_rows import fades, independent, shares, slow, stopped
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force, Torque
 
@@ -54,7 +53,7 @@ class Phase:
         return Phase(dyn, self.sides[which], self.still[which], self.locked[which], rubbed)
 
 
-class Friction:
+class Phases:
     """Dry friction of one trajectory's dynamics, or of trajectories `side_by_side` on the own derivation."""
 
     def __init__(self, dyn: Dynamics, *, side_by_side: bool = False) -> None:
@@ -62,7 +61,7 @@ class Friction:
         self._bound = dyn.model.constrained
         if self._bound and dyn._soft_constraints:
             BESIDE_SOFT_ROWS.admit(dyn.model)
-        self.dyn, self._own, self._side_by_side = dyn, dyn._friction, side_by_side
+        self.dyn, self._own, self._side_by_side = dyn, dyn._jumps, side_by_side
         self._names = dyn.model.velocity_names
         #: Velocities with friction.
         self.which = self._own.law.which
