@@ -182,7 +182,7 @@ def page() -> str:
 
 
 def test_rows_stand_in_the_order_of_how_far_they_held():
-    told = [(x.row.engine, x.row.method, x.reach, x.usable) for x in SPRING.lines]
+    told = [(x.row.engine, x.row.method, x.reach, x.usable) for x in SPRING._lines]
     assert told == [
         ("lagrangian", "auto", 4, 4),
         ("pinocchio", "radau", 3, 3),
@@ -191,20 +191,20 @@ def test_rows_stand_in_the_order_of_how_far_they_held():
         ("mujoco", "mujoco_euler", 0, 1),
         ("drake", "rk3", 0, 0),
     ]
-    assert SPRING.lines[-1].left_out
-    assert SPRING.choice is SPRING.lines[0]
-    assert TERMS.choice is None
+    assert SPRING._lines[-1].left_out
+    assert SPRING._choice is SPRING._lines[0]
+    assert TERMS._choice is None
 
 
 def test_an_engine_is_judged_by_its_furthest_method_but_by_the_first_of_its_terms_to_break():
-    assert {e: x.row.method for e, x in SPRING.best.items()} == {
+    assert {e: x.row.method for e, x in SPRING._best.items()} == {
         "lagrangian": "auto",
         "pinocchio": "radau",
         "mujoco": "rk4",
         "drake": "rk3",
     }
     # A term that it does not have is none that breaks.
-    first = {e: x.row.method for e, x in TERMS.best.items()}
+    first = {e: x.row.method for e, x in TERMS._best.items()}
     assert first == {"pinocchio": "forward_dynamics", "mujoco": "M"}
 
 

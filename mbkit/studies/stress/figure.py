@@ -116,7 +116,7 @@ def _map(case: CaseResult, palette: Palette, given: Axes | None) -> Figure:
     count, ax = len(case.values), _axes(given, len(case.rows), 0.24)
     breaks: dict[str, Any] = {"color": palette.ink, "linewidth": 2.2}
     theory: dict[str, Any] = {"color": palette.series[3], "linewidth": 2.0, "linestyle": _DASHED}
-    for y, line in enumerate(case.lines):
+    for y, line in enumerate(case._lines):
         for x, (cell, how) in enumerate(zip(line.row.cells[:count], line.outcomes, strict=False)):
             face, weight = SHADES[shade(cell, how)], "bold" if how == "silent" else "normal"
             ax.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=1.0))
@@ -129,7 +129,7 @@ def _map(case: CaseResult, palette: Palette, given: Axes | None) -> Figure:
             ax.vlines(beyond - 0.5, y - 0.5, y + 0.5, **theory)
     ax.set_xlim(-0.5, max(count, 1) - 0.5)
     ax.set_xticks(range(count), [number_text(v) for v in case.values], fontsize=8.5)
-    names = [one_line(f"{x.row.name}  {x.row.setting}".rstrip(), 44) for x in case.lines]
+    names = [one_line(f"{x.row._name}  {x.row.setting}".rstrip(), 44) for x in case._lines]
     ax.set_yticks(range(len(names)), names, fontsize=8.5)
     ax.tick_params(length=0)
     ax.spines[["left", "bottom"]].set_visible(False)
@@ -165,11 +165,11 @@ def _overview(cases: Sequence[CaseResult], palette: Palette, given: Axes | None)
     auto: dict[str, Any] = {"color": palette.ink, "marker": "|", "linestyle": "none"}
     for y, case in enumerate(cases):
         for k, engine in enumerate(engines):
-            if engine in case.best:
-                place = [case.best[engine].reach / len(case.values)], [y + (k - (len(engines) - 1) / 2) * apart]
+            if engine in case._best:
+                place = [case._best[engine].reach / len(case.values)], [y + (k - (len(engines) - 1) / 2) * apart]
                 ax.plot(*place, engine_mark(engine), color=palette.engine(engine), markersize=5.0)
-        if case.choice is not None:
-            place = [case.choice.reach / len(case.values)], [y]
+        if case._choice is not None:
+            place = [case._choice.reach / len(case.values)], [y]
             ax.plot(*place, markersize=22, markeredgewidth=1.4, zorder=1, **auto)
         span = f"{case.parameter} {number_text(case.values[0])} … {number_text(case.values[-1])} {case.unit}".rstrip()
         ax.text(1.03, y, one_line(span, 44), va="center", fontsize=8.0, color=palette.muted)
@@ -190,7 +190,7 @@ def _overview(cases: Sequence[CaseResult], palette: Palette, given: Axes | None)
         )
         for e in engines
     ]
-    if any(case.choice for case in cases):
+    if any(case._choice for case in cases):
         handles.append(Line2D([], [], markersize=12, label="method auto", **auto))
     if handles:
         legend(ax, handles, "upper", own=given is None, columns=4 if given is None else 2)

@@ -61,7 +61,7 @@ class Row:
     theory: float | None = None
 
     @property
-    def name(self) -> str:
+    def _name(self) -> str:
         """Engine and method; MuJoCo's own integrators have the engine in their names."""
         return run_name(self.engine, self.method)
 
@@ -136,7 +136,7 @@ class CaseResult:
     rows: tuple[Row, ...]
 
     @cached_property
-    def lines(self) -> list[Line]:
+    def _lines(self) -> list[Line]:
         """The rows in the order of what held, then of what was usable, then of run time."""
 
         def rank(line: Line) -> tuple[float, ...]:
@@ -146,31 +146,31 @@ class CaseResult:
         return sorted((Line.of(row, self.bar, self.name) for row in self.rows), key=rank)
 
     @cached_property
-    def best(self) -> dict[str, Line]:
+    def _best(self) -> dict[str, Line]:
         """The furthest method of each engine; of terms that it has, the first to break."""
-        ranked = self.lines
+        ranked = self._lines
         if self.measure == "terms":
             ranked = sorted(ranked, key=lambda line: (line.left_out, line.reach, line.usable))
         return {line.row.engine: line for line in reversed(ranked)}
 
     @property
-    def leader(self) -> Line | None:
+    def _leader(self) -> Line | None:
         """The furthest line; of terms, the first to break of the engine that is best in all of them."""
-        return max((x for x in self.best.values() if not x.left_out), key=lambda line: line.reach, default=None)
+        return max((x for x in self._best.values() if not x.left_out), key=lambda line: line.reach, default=None)
 
     @property
-    def choice(self) -> Line | None:
+    def _choice(self) -> Line | None:
         """mbkit's own choice of method, on the engine where it held furthest, if it was run."""
-        ours = (x for x in self.lines if x.row.method == AUTOMATIC_METHOD and x.row.engine in _OURS)
+        ours = (x for x in self._lines if x.row.method == AUTOMATIC_METHOD and x.row.engine in _OURS)
         return next((x for x in ours if not x.left_out), None)
 
     @property
-    def unbeaten(self) -> list[str]:
+    def _unbeaten(self) -> list[str]:
         """Engine and method of all that held furthest, or of terms the engines in all of them."""
-        most = max((line.reach for line in self.best.values()), default=0)
+        most = max((line.reach for line in self._best.values()), default=0)
         if self.measure == "terms":
-            return [engine for engine, line in self.best.items() if line.reach == most > 0]
-        return [line.row.name for line in self.lines if line.reach == most > 0]
+            return [engine for engine, line in self._best.items() if line.reach == most > 0]
+        return [line.row._name for line in self._lines if line.reach == most > 0]
 
 
 def engines_of(cases: Iterable[CaseResult]) -> list[str]:

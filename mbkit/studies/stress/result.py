@@ -168,7 +168,7 @@ class StressResult(ResultTable):
         """Return the document of the study; `full` has the rows of every case beyond the page, too."""
         runs = sum(item.cell.end != "not run" for item in self._csv_rows())
         silent, study = _silent_bullets(self.cases), f"{runs} runs of {counted(len(self.cases), 'case')}"
-        chosen = any(case.choice for case in self.cases)
+        chosen = any(case._choice for case in self.cases)
         shown = [c for c in _CASES if chosen or c.head != "auto"]
         drawn = doc.Figure(
             lambda: _drawn(self.cases), "How much of each sweep held: of each engine its furthest method."
@@ -235,7 +235,7 @@ def _leaders(cases: Iterable[CaseResult]) -> str:
     """Return what held furthest in most cases; terms and steps, which ask for stability alone, rank no method."""
     ran = [case for case in cases if case.rows]
     ranked = [case for case in ran if case.measure != "terms" and case.family != "step"] or ran
-    counts = Counter(name for case in ranked for name in case.unbeaten)
+    counts = Counter(name for case in ranked for name in case._unbeaten)
     if not counts:
         return f"nothing held in {counted(len(ranked), 'case')}"
     most = max(counts.values())
@@ -248,27 +248,27 @@ def _leaders(cases: Iterable[CaseResult]) -> str:
 
 def _behind(case: CaseResult) -> bool:
     """Return whether another line held further than mbkit's own choice."""
-    return case.choice is not None and case.choice.reach < max(line.reach for line in case.best.values())
+    return case._choice is not None and case._choice.reach < max(line.reach for line in case._best.values())
 
 
 def _behind_bullets(cases: Iterable[CaseResult]) -> Iterator[Bullet]:
     for case in filter(_behind, cases):
-        assert case.choice is not None
-        held = [_reached(line, case) for line in (case.choice, case.lines[0])]
+        assert case._choice is not None
+        held = [_reached(line, case) for line in (case._choice, case._lines[0])]
         held = [f"held {'' if text in ('all', 'nothing') else 'to '}{text}" for text in held]
-        yield Bullet(case.name, f"auto {held[0]}, {case.lines[0].row.name} {held[1]}", "!", "allowed")
+        yield Bullet(case.name, f"auto {held[0]}, {case._lines[0].row._name} {held[1]}", "!", "allowed")
 
 
 def _silent_count(case: CaseResult) -> int:
-    return sum(line.outcomes.count("silent") for line in case.lines)
+    return sum(line.outcomes.count("silent") for line in case._lines)
 
 
 def _silent_bullets(cases: Iterable[CaseResult]) -> list[Bullet]:
     """Return the methods that were wrong in silence, with the mildest value of each case; the most often so first."""
     where: dict[str, dict[int, tuple[CaseResult, int]]] = {}
     for k, case in enumerate(cases):
-        for line in (x for x in case.lines if "silent" in x.outcomes):
-            places = where.setdefault(line.row.name if case.measure == "terms" else line.row.method, {})
+        for line in (x for x in case._lines if "silent" in x.outcomes):
+            places = where.setdefault(line.row._name if case.measure == "terms" else line.row.method, {})
             first = line.outcomes.index("silent")
             places[k] = case, min(first, places.get(k, (case, first))[1])
     out = []
@@ -283,32 +283,32 @@ def _silent_bullets(cases: Iterable[CaseResult]) -> list[Bullet]:
 
 
 def _leader(case: CaseResult) -> str:
-    if case.leader is None:
+    if case._leader is None:
         return "none ran"
-    row = case.leader.row
-    return f"{row.engine} (terms)" if case.measure == "terms" else row.name
+    row = case._leader.row
+    return f"{row.engine} (terms)" if case.measure == "terms" else row._name
 
 
 def _auto(case: CaseResult) -> doc.Text:
-    if case.choice is None:
+    if case._choice is None:
         return ""
     return Span("behind", "allowed") if _behind(case) else Span("✓", "good")
 
 
 def _first_failure(case: CaseResult) -> str:
     """Return which row is the first that is of no use, and how."""
-    ended = [x for x in case.lines if not x.left_out and (*x.outcomes, "not run")[x.usable] not in UNKNOWN]
+    ended = [x for x in case._lines if not x.left_out and (*x.outcomes, "not run")[x.usable] not in UNKNOWN]
     if not ended:
         return ""
     line = min(ended, key=lambda x: x.usable)
     how = line.outcomes[line.usable]
-    return f"{number_text(line.row.cells[line.usable].value)} {WORDS.get(how, how)}: {line.row.name}"
+    return f"{number_text(line.row.cells[line.usable].value)} {WORDS.get(how, how)}: {line.row._name}"
 
 
 _CASES: Final = (
     Column("case", attrgetter("name"), most=22, fill=True),
     Column("furthest", _leader, most=24, fill=True),
-    Column("held to", lambda case: _reached(case.leader, case) if case.leader else "", fill=True),
+    Column("held to", lambda case: _reached(case._leader, case) if case._leader else "", fill=True),
     Column("auto", _auto, fill=True),
     Column("✗", lambda case: Span(str(_silent_count(case) or ""), "bad"), right=True),
     Column("first to break", lambda case: Span(_first_failure(case), "muted"), fill=True),
@@ -336,7 +336,7 @@ def _case_section(case: CaseResult, on: doc.On) -> Section:
     error = f"Columns are {swept}. Error: {_MEASURES.get(case.measure, '')}{why}."
     blocks: list[doc.Block] = [
         Paragraph(f"{case.about} Held: error ≤ {case.bar:g}."),
-        Table(columns, case.lines, style="map"),
+        Table(columns, case._lines, style="map"),
         Paragraph(error, on="page", note=True),
         doc.Facts([*_truths(case), *known]),
     ]
