@@ -293,10 +293,25 @@ for _engine in ("lagrangian", "pinocchio", "mujoco", "drake", "oracle"):
         ("derivatives", _derivatives, 1e-6),
     ):
         if _engine in ("lagrangian", "pinocchio", "oracle") or _what != "derivatives":
-            _gates = [_GATES[_engine]] if _engine in _GATES and _what == "M and inverse dynamics" else []
+            _asks = _what == "M and inverse dynamics" or (_engine == "mujoco" and _what == "accelerations")
+            _gates = [_GATES[_engine]] if _engine in _GATES and _asks else []
             if _what == "derivatives" and _engine == "pinocchio":
                 _gates = ["pinocchio", "pinocchio derivatives", "pinocchio forward derivatives"]
             column(f"engine {_engine}", f"{_engine}: {_what}", *_gates, close=_close, which=_engine)(_check)
+
+
+def resting(x: Example) -> Example:
+    """Return an example with dry friction whose joint x rests, held by a force below its limit, while others move."""
+    c, k = x.plain, x.plain.n - (3 if x.name.endswith("several") else 1)
+    at, level = np.arange(k, c.n), 0.3 if x.name == "joint.stiction" else 0.1
+    rows = np.eye(c.n)[at]
+    held = replace(
+        c, v=np.where(np.arange(c.n) < k, 0.05 * c.v, 0.0), parts=[Part("held", (), speeds=lambda c, q: rows)]
+    )
+    out, tau = replace(x, plain=held, tau=0.05 * x.tau), 0.05 * x.tau
+    needed = replace(out, plain=replace(held, parts=[])).force(out.accelerated()) - tau
+    tau[at] += needed[at] - level
+    return replace(out, tau=tau)
 
 
 @column("engine mujoco", "mujoco: friction loss", "mujoco friction loss")
@@ -305,7 +320,15 @@ def _friction_loss(x: Example, folder: Path) -> Told:
     soft = dynamics(x, x.model, "mujoco", soft_friction=True)
     held = x.model.constrained or x.model.needs.friction
     a = soft.constraint_law(x.q, x.v, x.tau).rigid if held else soft.forward_dynamics(x.q, x.v, x.tau)
-    return max(off(soft.mass_matrix(x.q), x.mass_matrix(x.plain.q)), off(a, x.accelerated()))
+    worst = max(off(soft.mass_matrix(x.q), x.mass_matrix(x.plain.q)), off(a, x.accelerated()))
+    if not x.model.needs.friction:
+        return worst
+    rest = resting(x)
+    # It creeps where it holds.
+    free = replace(rest, plain=replace(rest.plain, parts=[])).accelerated()
+    if abs(soft.forward_dynamics(rest.q, rest.v, rest.tau)[-1]) > 0.2 * abs(free[-1]):
+        raise AssertionError("it does not hold")
+    return max(worst, off(soft.constraint_law(rest.q, rest.v, rest.tau).rigid, rest.accelerated()))
 
 
 # Quantities of the own derivation
@@ -319,9 +342,25 @@ def _linearize(x: Example, folder: Path) -> Told:
 
 @column("quantities", "derivative of a step", "derivative of a step", close=1e-6)
 def _step_derivative(x: Example, folder: Path) -> Told:
+    """And against own steps where dry friction stops a joint within one."""
     out = engine(x.name).discretize(x.q, x.v, x.tau, STEP_OF_SLOPES)
     move, wanted = _slope(x.name)
-    return off(out.A @ move, wanted)
+    return max(off(out.A @ move, wanted), _stopped_slope(x) if x.model.needs.friction else 0.0)
+
+
+def _stopped_slope(x: Example) -> float:
+    dyn, n, h, dt = engine(x.name), len(x.v), 1e-5, 0.01
+    v = resting(x).v
+    A, B, _ = dyn.discretize(x.q, v, x.tau, dt)
+
+    def after(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return dyn.step(x.model.integrate(x.q, z[:n]), v + z[n : 2 * n], x.tau + z[2 * n :], dt)
+
+    worst = 0.0
+    for z, wanted in zip(np.eye(3 * n), np.hstack([A, B]).T, strict=True):
+        (q1, v1), (q0, v0) = after(h * z), after(-h * z)
+        worst = max(worst, off(wanted, np.concatenate([x.model.difference(q0, q1), v1 - v0]) / (2 * h)))
+    return worst
 
 
 @column("quantities", "sensitivities", close=1e-6)
@@ -441,8 +480,10 @@ def _base_parameters(x: Example, folder: Path) -> Told:
     bare = x.force(a, bodies=True)
     if x.name == "body.rotor":
         bare = engine(x.name).mass_matrix(x.q) @ a + engine(x.name, "oracle").nle(x.q, x.v)
-    if _told_apart(x.model) != base.count:
-        raise AssertionError("motions do not tell all of them apart")
+    # At the latest where little else moves.
+    for m in (x.model, *([x.model.lock({x.model.joint_names[0]: 0.3})] if x.model.constrained else [])):
+        if _told_apart(m) != m.base_parameters().count:
+            raise AssertionError("motions do not tell all of them apart")
     return off(engine(x.name).regressor(x.q, x.v, a, "base") @ base.values, bare)
 
 
@@ -479,14 +520,29 @@ def _operational(x: Example, folder: Path) -> Told:
         raise NotAskedError("no bodies")
     J = x.jacobian(x.plain.q)
     row = int(np.argmax(np.linalg.norm(J, axis=1)))
-    wanted = np.linalg.inv(J[[row]] @ np.linalg.solve(x.mass_matrix(x.plain.q), J[[row]].T))
-    return off(mb.operational_space(engine(x.name), x.q, x.tip, rows=[row]).inertia, wanted)
+    # The frame's answer to a force on it, whatever else holds it.
+    more = x.moved(0 * x.v, x.v, x.tau + J[row]) - x.moved(0 * x.v, x.v, x.tau)
+    return off(mb.operational_space(engine(x.name), x.q, x.tip, rows=[row]).inertia, [[1 / (J[row] @ more)]])
 
 
 @column("quantities", "loads of joints", "loads")
 def _loads(x: Example, folder: Path) -> Told:
-    rest = engine(x.name).newton_euler_residual(x.q, x.v, x.accelerated(), x.tau)
-    return off(rest, 0 * rest)
+    """Every body's balance of forces and moments; the load along a joint is its torque, with its springs and losses."""
+    dyn, joints = engine(x.name), [j for j in x.model.joints if j.type.nv]
+    rest = dyn.newton_euler_residual(x.q, x.v, x.accelerated(), x.tau)
+    under = (None, None, "local", None, x.tau) if x.model.constrained else (x.accelerated(),)
+    loads, worst = dyn.joint_wrenches(x.q, x.v, *under), off(rest, 0 * rest)
+    if len(loads) != len(joints):
+        raise AssertionError("not one load for each joint")
+    # What a gear or a drive adds there is not known here.
+    if not x.name.startswith(("coupler", "motion", "mimic")):
+        inside = x.name.startswith(("joint.", "coupling."))
+        torques = x.force(x.accelerated(), bodies=True) if inside else x.tau
+        for load, joint in zip(loads, joints, strict=True):
+            if joint.kind in ("revolute", "prismatic"):
+                along = joint.axes[0] @ load[slice(3, 6) if joint.kind == "revolute" else slice(3)]
+                worst = max(worst, off(along, torques[x.model.layout.v[joint.name].start]))
+    return worst
 
 
 @column("quantities", "loads of loops", "loads of loops")

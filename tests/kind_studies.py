@@ -79,6 +79,7 @@ from tests.kind_paths import (
     on_paper,
     program_of,
     registered,
+    resting,
     without_part,
 )
 from tests.plain_mechanics import Case, Part, derivative, rotation
@@ -513,6 +514,8 @@ def _variants(x: Example, folder: Path) -> Told:
 def _film(x: Example, folder: Path) -> Told:
     """Bodies stand where NumPy has them, with the vertical upwards."""
     scene = kept(x.name).animate(folder / "film.html", shapes="sticks").scene
+    if not x.links:
+        raise NotAskedError("no bodies")
     y = flow(x.name)[: x.plain.n]
     g = x.plain.weight
     up = np.eye(3) if not g.any() else scene.rotations[0, 0]
@@ -735,20 +738,6 @@ def _steady(x: Example, folder: Path) -> Told:
         raise NotAskedError("no coordinate is cyclic")
     out = mb.steady_motion(lag, rates=dict.fromkeys(cyclic, 2.0))
     return off(x.acceleration(x.t, out.q, out.v, 0 * out.v), 0 * out.v)
-
-
-def resting(x: Example) -> Example:
-    """Return an example with dry friction whose joint x rests, held by a force below its limit, while others move."""
-    c, k = x.plain, x.plain.n - (3 if x.name.endswith("several") else 1)
-    at, level = np.arange(k, c.n), 0.3 if x.name == "joint.stiction" else 0.1
-    rows = np.eye(c.n)[at]
-    held = replace(
-        c, v=np.where(np.arange(c.n) < k, 0.05 * c.v, 0.0), parts=[Part("held", (), speeds=lambda c, q: rows)]
-    )
-    out, tau = replace(x, plain=held, tau=0.05 * x.tau), 0.05 * x.tau
-    needed = replace(out, plain=replace(held, parts=[])).force(out.accelerated()) - tau
-    tau[at] += needed[at] - level
-    return replace(out, tau=tau)
 
 
 def stopping(x: Example, end: float) -> tuple[Example, np.ndarray]:

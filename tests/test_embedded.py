@@ -177,6 +177,17 @@ def test_tolerance_rules_the_error(case: str, kind: str) -> None:
     assert errors[-1] < 1e-4 * errors[0]
 
 
+@pytest.mark.thorough("floating_tree")
+@pytest.mark.parametrize("case", list(CASES))
+def test_the_other_road_comes_to_the_same(case: str) -> None:
+    model, q, v = CASES[case]
+    grid = np.linspace(0.0, 1.0, 5)
+    ours = simulate(both(model)["lanes"], q, v, 1.0, "rk853", rtol=1e-13, save=grid)
+    theirs = simulate(both(model)["stages"], q, v, 1.0, "dop853", rtol=1e-13, save=grid)
+    assert np.abs(ours.q - theirs.q).max() < 1e-11
+    assert np.abs(ours.v - theirs.v).max() < 1e-10
+
+
 @pytest.mark.parametrize("kind", ["lanes", "stages"])
 def test_tolerances_at_rounding_do_not_stall(kind: str) -> None:
     model, q, v = CASES["floating_tree"]

@@ -355,10 +355,10 @@ def test_threads_that_share_an_engine_get_the_values_of_their_own_states(name, e
             sys.setswitchinterval(1e-6)
             try:
                 with ThreadPoolExecutor(4) as pool:
-                    got = list(pool.map(call, *zip(*3 * rows, strict=True)))
+                    got = list(pool.map(call, *zip(*30 * rows, strict=True)))
             finally:
                 sys.setswitchinterval(before)
-            assert all(np.array_equal(x, y) for x, y in zip(got, 3 * expected, strict=True)), quantity
+            assert all(np.array_equal(x, y) for x, y in zip(got, 30 * expected, strict=True)), quantity
 
 
 def test_mujoco_writes_no_log_and_gives_no_number_where_there_is_none(tmp_path, monkeypatch, capfd):

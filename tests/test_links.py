@@ -134,7 +134,6 @@ def test_heavy_and_light_links_cost_no_more_digits_than_the_factors_of_M(masses)
         assert error(own, model, name) < max(1.2 * error(factors, model, name), 8 * EPS)
 
 
-@pytest.mark.thorough("anymal-kinova")
 @pytest.mark.parametrize("name", ["anymal-kinova", "kinova"])
 def test_short_forms_are_left_where_digits_would_go(name):
     """Near parallel axes moments about distant origins cancel, and constants that are rounded again show."""

@@ -489,8 +489,8 @@ def test_a_fixed_step_passes_a_pose_wherever_it_lies_in_the_step(engine, options
     assert np.abs(np.angle(np.exp(1j * off))).max() < close
 
 
-@pytest.mark.thorough(every=19)
-@pytest.mark.parametrize("place", [0.3, 1e-2, -1e-3, 1e-4, -1e-5, 1e-6, -1e-9, 0.0])
+@pytest.mark.thorough(every=18)
+@pytest.mark.parametrize("place", [-1e-9, 0.3, 1e-2, -1e-3, 1e-4, -1e-5, 1e-6, 0.0])
 @pytest.mark.parametrize("held", [False, True])
 @pytest.mark.parametrize(
     ("method", "rtol", "close"),
