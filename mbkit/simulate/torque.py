@@ -119,7 +119,7 @@ class StateFeedback:
 
     @property
     def pattern(self) -> str:
-        """Which entries of the gain are not zero: their bits, row after row, as hexadecimal digits."""
+        """Which entries of the gain are not zero, row after row, as hexadecimal digits of bits."""
         return np.packbits(self.gain != 0).tobytes().hex()
 
     @property

@@ -30,7 +30,7 @@ from mbkit.methods.registry import METHODS
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Checkpoint, Checkpointer, Progress
 from mbkit.studies._targets import methods_by_engine, numbers_of
-from mbkit.studies.measurement import BAR, Measurement
+from mbkit.studies.measurement import BAR, End, Measurement
 from mbkit.studies.stress.case import Case
 from mbkit.studies.stress.measure import TERMS, Limits, Prepared, measure, prepare
 from mbkit.studies.stress.measurements import CaseResult, Row
@@ -142,43 +142,38 @@ class CaseSweep:
             return f"rtol {max(self.limits.rtol, kind.least):.0e}"
         return f"dt {self.limits.dt:g} s"
 
-    def _call(self, worker: Worker, *call: Any, **stage_seconds: Any) -> Any:
-        """Return what a function answers for a value of the case, or the measurement of how the call ended."""
-        generation = worker.generation
-        answer = self._called(worker, *call, **stage_seconds)
-        if isinstance(answer, Measurement) and answer.end == "died" and worker.generation == generation:
-            # Calls before it may have left too little memory: a process of its own decides.
-            return self._called(worker, *call, **stage_seconds)
-        return answer
-
-    def _called(
+    def _call(
         self, worker: Worker, value: float, function: Callable[..., Any], *arguments: object, **stage_seconds: float
     ) -> Any:
-        try:
-            return worker.call(
-                function,
-                self.case,
-                value,
-                *arguments,
-                cpu_seconds=_with_grace(self.limits.preparation),
-                stage_seconds={stage: _with_grace(seconds) for stage, seconds in stage_seconds.items()},
-                deadline=self.deadline,
-            )
-        except (CallError, WorkerClosedError, WorkerStartError):
-            # No cell can be computed: these end the study.
-            raise
-        except WorkerTimeoutError as error:
-            if self.clock() >= self.deadline:
-                return Measurement(value, "not run", note=OUT_OF_TIME)
-            return Measurement(value, "slow", note=f"{error}{_DURING.get(worker.stage, '')}")
-        except WorkerDiedError as error:
-            return Measurement(value, "died", note=f"{error}{_DURING.get(worker.stage, '')}")
-        except MemoryError as error:
-            # Its process would keep memory that the next call needs.
-            worker.end()
-            return Measurement(value, "died", note=f"{OUT_OF_MEMORY} ({error})" if str(error) else OUT_OF_MEMORY)
-        except Exception as error:
-            return Measurement(value, "slow" if isinstance(error, TooLongError) else "refused", note=describe(error))
+        """Return what a function answers for a value of the case, or the measurement of how the call ended."""
+        limits: dict[str, Any] = {
+            "cpu_seconds": _with_grace(self.limits.preparation),
+            "stage_seconds": {stage: _with_grace(seconds) for stage, seconds in stage_seconds.items()},
+        }
+        end: End = "refused"
+        note = ""
+        # Calls before it may have left too little memory in a process: one of its own decides.
+        for _ in range(2):
+            generation = worker.generation
+            try:
+                return worker.call(function, self.case, value, *arguments, deadline=self.deadline, **limits)
+            except (CallError, WorkerClosedError, WorkerStartError):
+                # No cell can be computed: these end the study.
+                raise
+            except (WorkerTimeoutError, WorkerDiedError) as error:
+                end = "slow" if isinstance(error, WorkerTimeoutError) else "died"
+                if end == "slow" and self.clock() >= self.deadline:
+                    return Measurement(value, "not run", note=OUT_OF_TIME)
+                note = f"{error}{_DURING.get(worker.stage, '')}"
+            except MemoryError as error:
+                # Its process would keep memory that the next call needs.
+                worker.end()
+                end, note = "died", f"{OUT_OF_MEMORY} ({error})" if str(error) else OUT_OF_MEMORY
+            except Exception as error:
+                end, note = "slow" if isinstance(error, TooLongError) else "refused", describe(error)
+            if end != "died" or worker.generation != generation:
+                break
+        return Measurement(value, end, note=note)
 
     def prepare(self, worker: Worker, until: float) -> bool:
         """Have the truths computed in order, begin none after `until`, and return whether all are there."""

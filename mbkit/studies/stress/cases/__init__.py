@@ -9,7 +9,7 @@ from mbkit.studies.stress.case import Case, Family
 from mbkit.studies.stress.cases._common import TABLE
 
 # They fill the table, in this order within a family.
-from mbkit.studies.stress.cases import springs, rigid, loops, rubbing  # noqa: F401  # isort: skip
+from mbkit.studies.stress.cases import springs, rigid, loops  # noqa: F401  # isort: skip
 
 __all__ = ["CASES", "get", "names"]
 
