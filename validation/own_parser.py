@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import weakref
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines.remote.packages import EngineVersion
-from mbkit.engines.remote.process import RemoteError, new_key, process_of
+from mbkit.engines.remote.process import Held, RemoteError
 from mbkit.errors import UnsupportedError
 from mbkit.model import Model
 
@@ -37,9 +35,9 @@ class OwnParser:
     """
 
     def __init__(self, version: EngineVersion, text: str, format_: str, model: Model) -> None:
-        self.version, self._process, self._key = version, process_of(version), new_key()
-        weakref.finalize(self, self._process.unneeded.append, self._key)
-        joints = self._call("import", module=str(SERVED), text=text, format_=format_)[0]["joints"]
+        file = {"module": str(SERVED), "text": text, "format_": format_}
+        self.version, self._held = version, Held(version, lambda ask: ask("import", **file)[0])
+        joints = self._held.head["joints"]
         moving = [j for j in model.layout.joints if j.type.nv]
         if any(j.type.nv > 1 for j in moving):
             raise UnsupportedError(f"{version}: a file is compared where each joint has one coordinate")
@@ -52,12 +50,6 @@ class OwnParser:
         self._at_v = np.array([joints[j.name][1][0] for j in moving], int)
         self._nq = sum(len(q) for q, _ in joints.values())
 
-    def _call(self, name: str, *arrays: Array, **plain: Any) -> tuple[dict[str, Any], list[Array]]:
-        try:
-            return self._process.call(name, arrays, self._key, self.version.seconds, **plain)
-        except RemoteError as error:
-            raise UnsupportedError(f"{self.version}: {error}") from None
-
     def term(self, quantity: str, q: Array, v: Array) -> Array:
         """Return the mass matrix, gravity or nle at a batch of states."""
         out = []
@@ -67,7 +59,10 @@ class OwnParser:
                 # A continuous joint may be a cosine and a sine.
                 x[at] = angle if len(at) == 1 else (np.cos(angle), np.sin(angle))
             u[self._at_v] = rate
-            value = self._call(quantity, x, *([u] if quantity == "nle" else []))[1][0]
+            try:
+                value = self._held.ask(quantity, x, *([u] if quantity == "nle" else []))[0]
+            except RemoteError as error:
+                raise UnsupportedError(f"{self.version}: {error}") from None
             own = value[np.ix_(self._at_v, self._at_v)] if value.ndim == 2 else value[self._at_v]
             out.append(own)
         return np.array(out)

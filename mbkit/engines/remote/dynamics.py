@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any, Final
@@ -19,7 +18,7 @@ from mbkit.engines.elements.passive import JointPassive, pull
 from mbkit.engines.frames_and_momenta import ALIGNED, seen_from
 from mbkit.engines.remote.description import REMOTE_RUNS, REMOTE_RUNS_OF_JOINTS, places, travelling
 from mbkit.engines.remote.packages import EngineVersion
-from mbkit.engines.remote.process import RemoteError, new_key, process_of
+from mbkit.engines.remote.process import Held, RemoteError
 from mbkit.errors import NumericalError, UnsupportedError
 from mbkit.model import Frame, Model
 from mbkit.model.quantities import QUANTITIES
@@ -58,14 +57,18 @@ class VersionDynamics(MappedDynamics):
     matrix and centre of mass where it has no function for them. A stack of states is one call.
     """
 
-    def __init__(self, model: Model, version: EngineVersion) -> None:
+    def __init__(self, model: Model, version: EngineVersion, held: Held | None = None) -> None:
         self.version, self._path = version, version.package.path
         super().__init__(model)
         self._convention = version.package.convention
-        self._data, self._names = self._travelling()
-        self._process, self._key, self._held = process_of(version), new_key(), 0
-        weakref.finalize(self, self._process.unneeded.append, self._key)
-        self._build()
+        #: The engine's joints of each joint.
+        names: Mapping[str, Sequence[str]] = {j.name: (j.name,) for j in self.model.joints}
+        if held is None:
+            data, names = travelling(version.package.steps, self.model)
+            held = Held(version, lambda ask: ask("build", **data)[0], f"refuses {self.model.name}: ")
+        self._held, self._gives = held, frozenset(held.head["gives"])
+        self._places = places(self._convention, self.model, names, held.head["places"])
+        self._v_index = self._places.v_index
         layout, gives = self.model.layout, self._gives
         orders = (np.arange(n) for n in layout.sizes[2:])
         self._springs = JointPassive(self.model, *orders)
@@ -102,42 +105,17 @@ class VersionDynamics(MappedDynamics):
     def _of_model(self, model: Model, form: str) -> VersionDynamics:  # noqa: ARG002  # nothing is derived
         return type(self)(model, self.version)
 
-    def _call(self, name: str, *arrays: Array, **plain: Any) -> tuple[dict[str, Any], list[Array]]:
-        stacked = bool(arrays) and arrays[0].ndim > 1
-        return self._process.call(name, arrays, self._key, self.version.seconds, stacked, **plain)
-
     def _value(self, method: Callable[..., Any], states: list[Array], more: tuple[Any, ...], size: int | None) -> Any:
         # The methods below take stacks of states: one call of the process for all of them.
         name = getattr(method, "__name__", "")
         together = size and name in vars(VersionDynamics) and name[1:] in QUANTITIES
         return method(*states, *more) if together else super()._value(method, states, more, size)
 
-    def _travelling(self) -> tuple[dict[str, Any], Mapping[str, Sequence[str]]]:
-        """Return what is sent, and the engine's joints of each joint."""
-        return travelling(self.version.package.steps, self.model)
-
-    def _build(self) -> None:
-        """Send the model, to a process that does not hold it yet."""
-        self._held = self._process.start()
-        try:
-            head, _ = self._call("build", **self._data)
-        except RemoteError as error:
-            raise UnsupportedError(f"{self.engine}: refuses {self.model.name}: {error}") from None
-        self._take_head(head)
-
-    def _take_head(self, head: Mapping[str, Any]) -> None:
-        """Take the places of the engine's coordinates, and the names of its quantities."""
-        self._places = places(self._convention, self.model, self._names, head["places"])
-        self._v_index, self._gives = self._places.v_index, frozenset(head["gives"])
-
     def _ask(self, name: str, *arrays: Array, **plain: Any) -> list[Array]:
         if name not in self._gives:
             raise UnsupportedError(f"{self.engine} cannot give {name}: its file here has no such function")
-        if self._process.start() != self._held:
-            # The one that held the model has died since.
-            self._build()
         try:
-            return self._call(name, *arrays, **plain)[1]
+            return self._held.ask(name, *arrays, **plain)
         except RemoteError as error:
             raise NumericalError(f"{self.engine}: {name} of {self.model.name}: {error}") from None
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import copy
-import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from types import SimpleNamespace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -15,8 +14,7 @@ from mbkit._check import Array
 from mbkit.engines.imported import Imported, Parts, checked, written
 from mbkit.engines.remote.dynamics import VersionDynamics
 from mbkit.engines.remote.packages import PACKAGES, EngineVersion
-from mbkit.engines.remote.process import RemoteError, new_key, process_of
-from mbkit.errors import UnsupportedError
+from mbkit.engines.remote.process import Answer, Held
 from mbkit.model import Coupler, Model
 
 #: The file in `remote` of engines that take MuJoCo's model.
@@ -34,35 +32,36 @@ def read(version: EngineVersion, text: str, format_: str, floating_base: bool, f
     Raises `UnsupportedError` where it refuses the text, and `EngineProcessError` where it ends its process or takes
     longer than `version.seconds`.
     """
-    kind = _OfMujoco if version.package.importer == _MUJOCO else _Read
-    return kind(version, text, format_, floating_base, files).imported()
+    file = _File(text, format_, floating_base, files)
+    if version.package.importer == _MUJOCO:
+        return _OfMujoco(version, file, changes={}).imported()
+    return _Read(version, file).imported()
+
+
+class _File(NamedTuple):
+    text: str
+    format: str
+    floating_base: bool
+    files: Mapping[str, bytes]
+
+    def read(self, module: str, more: Mapping[str, Any], ask: Callable[..., Answer]) -> dict[str, Any]:
+        """Return what a module of the process says of it."""
+        with written(self.text, self.files) as path:
+            file = {"path": str(path), "format_": self.format, "floating": self.floating_base}
+            return ask("import", module=module, **file, **more)[0]
 
 
 class _Read(VersionDynamics):
     """An engine on its own reading of a file."""
 
-    def __init__(self, version: EngineVersion, *file: Any, changes: Mapping[str, Any] | None = None) -> None:
-        self.version, self._file, self._own_key = version, file, new_key()
-        #: Numbers to set in the model before it is held.
-        self._changes: dict[str, Any] = {} if changes is None else {"changes": changes}
-        process = process_of(version)
-        weakref.finalize(self, process.unneeded.append, self._own_key)
-        self._generation = process.start()
-        self.said = self._import()
-        super().__init__(checked(version.name, self._described()), version)
+    def __init__(self, version: EngineVersion, file: _File, **more: Any) -> None:
+        self._file, self._more = file, more
+        held = Held(version, partial(file.read, version.package.importer, more))
+        self.said = held.head
+        super().__init__(checked(version.name, self._described(version.engine)), version, held)
 
-    def _import(self) -> dict[str, Any]:
-        text, format_, floating, files = self._file
-        ask = partial(process_of(self.version).call, "import", (), self._own_key, self.version.seconds)
-        try:
-            with written(text, files) as path:
-                module = self.version.package.importer
-                return ask(module=module, path=str(path), format_=format_, floating=floating, **self._changes)[0]
-        except RemoteError as error:
-            raise UnsupportedError(f"{self.version}: {error}") from None
-
-    def _described(self) -> Model:
-        return _model(self.version.engine, self.said)
+    def _described(self, engine: str) -> Model:
+        return _model(engine, self.said)
 
     def imported(self) -> Imported:
         """Return the reading."""
@@ -72,17 +71,6 @@ class _Read(VersionDynamics):
             notes.append(f"joints that close a loop, in none of the terms: {', '.join(said['loops'])}")
         held = tuple(Coupler(*x) for x in said["mimics"])
         return Imported(self.model, self.terms, tuple(notes), (), held, holds_mimics=said["holds"] * bool(held))
-
-    def _travelling(self) -> tuple[dict[str, Any], Mapping[str, Sequence[str]]]:
-        return {}, {j.name: (j.name,) for j in self.model.joints}
-
-    def _build(self) -> None:
-        self._held, self._key = self._process.start(), self._own_key
-        if self._held != self._generation:
-            # The process that held the reading has died since.
-            self._import()
-            self._generation = self._held
-        self._take_head(self.said)
 
     def terms(self, q: Array, v: Array, without: tuple[str, ...] = ()) -> dict[str, Array]:
         """Return M, g, nle and passive at a batch of states, without some of what acts beside bodies and joints."""
@@ -96,17 +84,14 @@ class _Read(VersionDynamics):
 
 
 class _OfMujoco(_Read):
-    """The same of MuJoCo's model as `put_model` holds it."""
+    """The same of MuJoCo's model as `put_model` holds it; `changes` are numbers to set in the model before."""
 
-    def __init__(self, version: EngineVersion, *file: Any, changes: Mapping[str, Any] | None = None) -> None:
-        super().__init__(version, *file, changes=changes or {})
-
-    def _described(self) -> Model:
+    def _described(self, engine: str) -> Model:
         # The import loads MuJoCo.
         from mbkit.engines.mujoco import importer
 
         self._held_model = _HeldModel(self.said)
-        self._reading = importer.Described(self.version.engine, self._held_model)
+        self._reading = importer.Described(engine, self._held_model)
         return self._reading.model
 
     def imported(self) -> Imported:
@@ -120,7 +105,7 @@ class _OfMujoco(_Read):
         changes = {k: x.tolist() for k, x in vars(m).items() if isinstance(x, np.ndarray) and (x != before[k]).any()}
         was = vars(self._held_model.opt)
         changes |= {k: x for k, x in vars(m.opt).items() if np.any(np.asarray(x) != was[k])}
-        return type(self)(self.version, *self._file, changes={**self._changes["changes"], **changes})
+        return type(self)(self.version, self._file, changes={**self._more["changes"], **changes})
 
 
 class _HeldModel:

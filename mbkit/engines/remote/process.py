@@ -11,7 +11,8 @@ import itertools
 import os
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+import weakref
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,11 +21,15 @@ from mbkit._child_process import Child, WorkerDiedError, WorkerStartError, Worke
 from mbkit._fork import fork_safe
 from mbkit.engines.remote.packages import EngineVersion
 from mbkit.engines.remote.served import serve
-from mbkit.errors import EngineProcessError
+from mbkit.errors import EngineProcessError, UnsupportedError
 
 #: Seconds until a library is loaded.
 _START_SECONDS: Final = 120.0
 _SERVE: Final = Path(serve.__file__)
+
+
+#: Head and arrays.
+Answer = tuple[dict[str, Any], list[Array]]
 
 
 class RemoteError(Exception):
@@ -42,26 +47,19 @@ class EngineProcess(Child):
         self.unneeded: list[int] = []
 
     def call(
-        self,
-        name: str,
-        arrays: Sequence[Array] = (),
-        model: int = 0,
-        seconds: float | None = None,
-        stacked: bool = False,
-        **plain: Any,
-    ) -> tuple[dict[str, Any], list[Array]]:
+        self, name: str, arrays: Sequence[Array], model: int, seconds: float, stacked: bool, **plain: Any
+    ) -> Answer:
         """Return the head and the arrays of the answer; `stacked` arrays hold a state in each row.
 
         Raises `RemoteError` where the engine refuses, and `EngineProcessError` where the process died or was ended
         after `seconds`; the next call starts another.
         """
-        limit = self.version.seconds if seconds is None else seconds
         with self._lock:
             self.start()
             while self.unneeded:
                 self._exchange(serve.packed({"call": "forget", "model": self.unneeded.pop()}), self.version.seconds)
             message = {"call": name, "model": model, "with": plain, "stacked": stacked}
-            head, out = self._exchange(serve.packed(message, arrays), limit)
+            head, out = self._exchange(serve.packed(message, arrays), seconds)
         if "error" in head:
             raise RemoteError(head["error"])
         return head, out
@@ -79,7 +77,7 @@ class EngineProcess(Child):
         kept = {k: x for k, x in os.environ.items() if not k.startswith("PYTHON")}
         return [*map(str, command)], kept | self.version.variables()
 
-    def _exchange(self, message: bytes, seconds: float) -> tuple[dict[str, Any], list[Array]]:
+    def _exchange(self, message: bytes, seconds: float) -> Answer:
         with self._translating_errors(seconds):
             self._send(message)
             answer = self._receive(deadline=time.perf_counter() + seconds)
@@ -113,9 +111,37 @@ def process_of(version: EngineVersion) -> EngineProcess:
     return _processes[version.name]
 
 
-def new_key() -> int:
-    """Return a number for a model that no other has."""
-    return next(_keys)
+class Held:
+    """A model that the process of a version holds, and which is sent again where that process has died.
+
+    `send` makes the process hold it, by calls of the function that it gets; `head` is what it returned. Where the
+    engine refuses, the error says so after `refuses`.
+    """
+
+    def __init__(
+        self, version: EngineVersion, send: Callable[[Callable[..., Answer]], dict[str, Any]], refuses: str = ""
+    ) -> None:
+        self._process, self._key, self._seconds = process_of(version), next(_keys), version.seconds
+        self._send, self._refuses = send, f"{version}: {refuses}"
+        weakref.finalize(self, self._process.unneeded.append, self._key)
+        self._hold()
+
+    def _hold(self) -> None:
+        self._generation = self._process.start()
+        try:
+            self.head = self._send(self._call)
+        except RemoteError as error:
+            raise UnsupportedError(f"{self._refuses}{error}") from None
+
+    def ask(self, name: str, *arrays: Array, **plain: Any) -> list[Array]:
+        """Return the arrays of an answer, at a state or a stack of them; raises `RemoteError`."""
+        if self._process.start() != self._generation:
+            self._hold()
+        return self._call(name, *arrays, **plain)[1]
+
+    def _call(self, name: str, *arrays: Array, **plain: Any) -> Answer:
+        stacked = bool(arrays) and arrays[0].ndim > 1
+        return self._process.call(name, arrays, self._key, self._seconds, stacked, **plain)
 
 
 def end(version: EngineVersion) -> None:

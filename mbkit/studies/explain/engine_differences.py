@@ -127,18 +127,22 @@ class _Engines:
         except MbkitError:
             return {}
 
-    def _gaps(self, values: Values) -> Gaps:
-        return gaps(values, self.target, self.at, self.model)
+    def _gaps(self, values: Values, other: Values | None = None) -> Gaps:
+        return gaps(values, self.target if other is None else other, self.at, self.model)
 
     def defects(self) -> list[Cause]:
         """Return the known defects that show: the engine's other computation of the value is right."""
         out, sides = [], [(dyn, *self._further_terms(dyn)) for dyn in (self.a, self.b)]
-        found = gaps(sides[0][1], sides[1][1], self.at, self.model)
-        self.further_gaps = tuple(gap for gap in found if gap.term != "M")
+        self.further_gaps = tuple(g for g in self._gaps(sides[0][1], sides[1][1]) if g.term != "M")
         for gap in (x for x in self.further_gaps if x.relative > self.tolerance):
             for (dyn, _, known), (_, other, _) in (sides, sides[::-1]):
-                right = {"M": self.values[dyn]["M"]} | self._from_other_terms(dyn, gap.term)
-                same = [x for x in gaps(right, other, self.at, self.model) if x.term == gap.term]
+                own = self.values[dyn]
+                right = {"M": own["M"]}
+                if gap.term != "C v":
+                    right[gap.term] = np.asarray(0.5 * np.einsum("ni,nij,nj->n", self.at.v, own["M"], self.at.v))
+                elif {"nle", "g"} <= own.keys():
+                    right[gap.term] = own["nle"] - own["g"]
+                same = [x for x in self._gaps(right, other) if x.term == gap.term]
                 if gap.term in known and same and same[0].relative <= self.tolerance:
                     says = f"{gap.term}: {known[gap.term].split('; returned as it is')[0]}"
                     effects = {gap.term: gap.relative}
@@ -155,12 +159,6 @@ class _Engines:
                 if issubclass(warning.category, KnownDefectWarning):
                     known.setdefault(term, str(warning.message))
         return values, known
-
-    def _from_other_terms(self, dyn: Dynamics, term: str) -> Values:
-        own = self.values[dyn]
-        if term == "C v":
-            return {term: own["nle"] - own["g"]} if {"nle", "g"} <= own.keys() else {}
-        return {term: np.asarray(0.5 * np.einsum("ni,nij,nj->n", self.at.v, own["M"], self.at.v))}
 
     def causes(self) -> list[Cause]:
         """Return the first mistake after which the first engine answers as the second does."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import chain, permutations, product
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -35,6 +35,8 @@ from mbkit.studies.explain.merged_model import (
     number_text,
     rules_for,
 )
+
+Part = TypeVar("Part")
 
 #: Kind of a difference, and noun, where they are not the description's word for a part.
 _WORDS: Final = {
@@ -263,6 +265,10 @@ def _units(unit: str, name: str, x: Any) -> Iterator[tuple[str, str, dict[str, A
 
 def _merge_mistakes(links: Sequence[LinkInBody]) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Yield mistakes with links that are fixed to each other."""
+
+    def unturned(x: LinkInBody) -> LinkInBody:
+        return replace(x, matter=replace(x.matter, inertia=x.R.T @ x.matter.inertia @ x.R))
+
     own, *fixed = links
     heavy = [x for x in fixed if x.massive]
     for one in heavy:
@@ -276,7 +282,7 @@ def _merge_mistakes(links: Sequence[LinkInBody]) -> Iterator[tuple[str, str, dic
         for kind, how, change in (
             ("fused with a rotated frame", "without turning it", lambda x: replace(x, R=np.eye(3))),
             ("fused with a rotated frame", "turned the wrong way", lambda x: replace(x, R=x.R.T)),
-            ("fused with a rotated frame", "without turning its inertia", _with_unturned_inertia),
+            ("fused with a rotated frame", "without turning its inertia", unturned),
             ("fused at the wrong place", "at the origin", lambda x: replace(x, p=np.zeros(3))),
         ):
             whole = composite([change(x) if x in some else x for x in links])
@@ -285,10 +291,6 @@ def _merge_mistakes(links: Sequence[LinkInBody]) -> Iterator[tuple[str, str, dic
         total = sum((x.mass_properties.inertia for x in links), np.zeros((3, 3)))
         says = "adds the inertias of its links, each about its own centre of mass"
         yield "inertia about the wrong point", says, {"inertia": total}
-
-
-def _with_unturned_inertia(x: LinkInBody) -> LinkInBody:
-    return replace(x, matter=replace(x.matter, inertia=x.R.T @ x.matter.inertia @ x.R))
 
 
 def _product_mistakes(I: Array) -> Iterator[tuple[str, str, dict[str, Any]]]:
@@ -585,7 +587,9 @@ def _same_motion(a: Motion, b: Motion, near: Tolerances) -> bool:
 # against each other, and a slider's point may be anywhere along its axis.
 
 
-def paired(some: Iterable[Any], left: list[Any], apart: Callable[[Any, Any], float]) -> tuple[list[Any], list[Any]]:
+def paired(
+    some: Iterable[Part], left: list[Part], apart: Callable[[Part, Part], float]
+) -> tuple[list[tuple[Part, Part]], list[Part]]:
     """Pair parts with the nearest of `left`, which are taken out of it, and return those without a partner.
 
     `apart` is the distance of two, infinite where they are no pair.

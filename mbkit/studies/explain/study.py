@@ -89,7 +89,9 @@ def explain(
     # Mistakes that are tried on a description may leave one that cannot be.
     with unchecked():
         one, other = (replace(x, time=_moment(model_a, model_b)) for x in (model_a, model_b))
-        out = _Descriptions(one, other, names or _names(a, b), samples, seed, tolerance).explain()
+        own = [x.engine if isinstance(x, Dynamics) else x.name for x in (a, b)]
+        names = names or ((own[0], own[1]) if own[0] != own[1] else ("first", "second"))
+        out = _Descriptions(one, other, names, samples, seed, tolerance).explain()
         return engine_causes(a, b, out) if isinstance(a, Dynamics) or isinstance(b, Dynamics) else out
 
 
@@ -109,11 +111,6 @@ def _moment(*models: Model) -> float:
     """Return a time at which nothing begins, and which the tables of motions have."""
     intervals = [(_MOMENT_S, _MOMENT_S), *(x.interval for x in models)]
     return min(max(first for first, _ in intervals), *(last for _, last in intervals))
-
-
-def _names(a: Model | Dynamics, b: Model | Dynamics) -> tuple[str, str]:
-    one, other = (x.engine if isinstance(x, Dynamics) else x.name for x in (a, b))
-    return (one, other) if one != other else ("first", "second")
 
 
 @dataclass
@@ -177,7 +174,7 @@ class _Descriptions:
             only_a=matching.only_a,
             only_b=matching.only_b,
             causes=causes,
-            notes=(*_notes(one, moved_frames, matching), *_named_frames(self.a, self.b, near)),
+            notes=tuple(_notes(self.a, self.b, near, len(one.model.joints), moved_frames, matching)),
             explained=explained,
             left=after,
             subtree=() if explained else terms.minimal_differing_subtree(changed.model, differs),
@@ -271,18 +268,15 @@ class _Descriptions:
             yield self._cause(Hypothesis("joint order", "", says), {})
 
 
-def _notes(one: MergedModel, moved_frames: Sequence[str], matching: Matching) -> Iterator[str]:
+def _notes(
+    a: Model, b: Model, near: Tolerances, many: int, moved_frames: Sequence[str], matching: Matching
+) -> Iterator[str]:
     if moved_frames:
-        many = f"{len(moved_frames)} of {len(one.model.joints)} frames"
-        frames = many if len(moved_frames) > 3 else ", ".join(moved_frames)
+        frames = f"{len(moved_frames)} of {many} frames" if len(moved_frames) > 3 else ", ".join(moved_frames)
         yield f"frames drawn elsewhere, which changes no term: {frames}"
     if by_structure := sum(m.how == "structure" for m in matching.pairs):
         yield f"{by_structure} of {len(matching.pairs)} joints were matched by structure, the others by name"
-
-
-def _named_frames(a: Model, b: Model, near: Tolerances) -> Iterator[str]:
-    """Yield the frames of one name and body that stand elsewhere on it; descriptions are compared without frames."""
+    # Descriptions are compared without frames.
     there = {(f.name, f.body): f for f in b.frames}
-    moved = [f.name for f in a.frames if not near.same(f, there.get((f.name, f.body), f))]
-    if moved:
+    if moved := [f.name for f in a.frames if not near.same(f, there.get((f.name, f.body), f))]:
         yield f"named frames that stand elsewhere, which changes no term: {', '.join(moved)}"

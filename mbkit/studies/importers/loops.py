@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from mbkit.studies.explain.merged_model import Tolerances
 
 #: Attributes that switch equalities off, by element.
 _SWITCHES: Final = {**dict.fromkeys(("equality", "connect", "weld"), ("active",)), "flag": ("equality", "constraint")}
+#: Parts by which a file, or an importer, holds joints.
+Held = Loop | Coupler
+Kind = TypeVar("Kind", Loop, Coupler)
 #: By how much a part differs, its name, and what differs in words.
 Difference = tuple[float, str, str]
 
@@ -27,14 +30,14 @@ Difference = tuple[float, str, str]
 class Written(NamedTuple):
     """The loops and couplers that importers are compared with."""
 
-    active: Sequence[Loop | Coupler] = ()
+    active: Sequence[Held] = ()
     #: With those that the file has switched off.
-    every: Sequence[Loop | Coupler] = ()
+    every: Sequence[Held] = ()
     #: Why they are unknown; empty where they are known.
     faults: str = ""
 
 
-def between_joints(model: Model, parts: Sequence[Any], names: Mapping[str, str] | None = None) -> list[Any]:
+def between_joints(model: Model, parts: Sequence[Held], names: Mapping[str, str] | None = None) -> list[Loop | Coupler]:
     """Return loops of a description on the joints that carry their ends, and couplers of these joints.
 
     The ends' poses are those in the world, which is the joint "", where all coordinates are zero; `names` has other
@@ -54,7 +57,7 @@ def between_joints(model: Model, parts: Sequence[Any], names: Mapping[str, str] 
     return [*loops, *map(_ordered, own)]
 
 
-def loop_differences(written: Written, read: Sequence[Any], near: Tolerances) -> list[Difference]:
+def loop_differences(written: Written, read: Sequence[Held], near: Tolerances) -> list[Difference]:
     """Return what differs between the loops of a file and those that were read."""
 
     def apart(a: Loop, b: Loop) -> float:
@@ -68,7 +71,7 @@ def loop_differences(written: Written, read: Sequence[Any], near: Tolerances) ->
     return _differences(Loop, written, read, apart, says)
 
 
-def coupler_differences(written: Written, file: Model, read: Sequence[Any], tolerance: float) -> list[Difference]:
+def coupler_differences(written: Written, file: Model, read: Sequence[Held], tolerance: float) -> list[Difference]:
     """Return the same of couplers: an importer may hold the file's mimic joints by them, or leave these free."""
 
     def apart(a: Coupler, b: Coupler) -> float:
@@ -84,12 +87,12 @@ def coupler_differences(written: Written, file: Model, read: Sequence[Any], tole
 
 
 def _differences(
-    of: type,
+    of: type[Kind],
     written: Written,
-    read: Sequence[Any],
-    apart: Callable[..., float],
-    says: Callable[..., str],
-    implied: Callable[..., bool] = lambda _: False,
+    read: Sequence[Held],
+    apart: Callable[[Kind, Kind], float],
+    says: Callable[[Kind, Kind], str],
+    implied: Callable[[Kind], bool] = lambda _: False,
 ) -> list[Difference]:
     active, inactive, left = ([x for x in some if isinstance(x, of)] for some in (*written[:2], read))
     pairs, lost = paired(active, left, apart)
@@ -124,7 +127,7 @@ def _ordered(x: Coupler) -> Coupler:
     return replace(x, joint=joint, leader=tuple(name for name, _ in others), ratio=ratios, offset=x.offset / c)
 
 
-def _called(x: Any) -> str:
+def _called(x: Held) -> str:
     """Return a part's name, or its kind where an importer gives none, and its joints."""
     if isinstance(x, Loop):
         joints = " and ".join(repr(name) if name else "the world" for name in (x.body_a, x.body_b))

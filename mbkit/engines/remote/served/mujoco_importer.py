@@ -22,7 +22,8 @@ _ACTING = (
     *("tendon_dampingpoly", "tendon_armature", "tendon_lengthspring", "actuator_gear", "actuator_armature"),
     *("actuator_damping", "actuator_dampingpoly", "actuator_biasprm", "actuator_gainprm"),
 )
-_NAMED = {"body": "BODY", "jnt": "JOINT", "tendon": "TENDON", "actuator": "ACTUATOR"}
+#: Names of what a field's rows belong to, by how the field begins.
+_OF = {"body": "body", "jnt": "joint", "dof": "joint", "tendon": "tendon", "actuator": "actuator"}
 _FREE = "root_joint"
 
 
@@ -44,15 +45,6 @@ def imported(adapter: Any, path: str, format_: str, floating: bool, changes: dic
             getattr(m, name)[:] = np.reshape(values, np.shape(getattr(m, name)))
     # As users call it: what it lacks is refused here, contacts and sensors too.
     held = adapter.put(m)
-    fields, notes = {}, []
-    for name in dir(m):
-        if name in _SIZES or (name.startswith(_PARTS) and isinstance(getattr(m, name), np.ndarray)):
-            whole = np.array(getattr(m, name))
-            own = _own(held, name, whole)
-            if name in _ACTING:
-                notes += _notes(m, name, whole, own)
-            fields[name] = (whole if own is None else own).tolist()
-    opt = {name: np.array(getattr(m.opt, name)).tolist() for name in _OPTIONS}
     labels = {
         kind: [mujoco.mj_id2name(m, getattr(mujoco.mjtObj, "mjOBJ_" + of), i) or "" for i in range(n)]
         for kind, of, n in (
@@ -60,6 +52,21 @@ def imported(adapter: Any, path: str, format_: str, floating: bool, changes: dic
             *(("tendon", "TENDON", m.ntendon), ("actuator", "ACTUATOR", len(m.actuator_trntype))),
         )
     }
+    fields, notes = {}, []
+    for name in dir(m):
+        if name in _SIZES or (name.startswith(_PARTS) and isinstance(getattr(m, name), np.ndarray)):
+            whole = np.array(getattr(m, name))
+            own = _own(held, name, whole)
+            if name in _ACTING and len(rows := _lost(whole, own)):
+                kind = name.split("_", maxsplit=1)[0]
+                names = labels.get(_OF.get(kind, ""))
+                some = m.dof_jntid[rows[:6]] if kind == "dof" else rows[:6]
+                unnamed = "coordinate" if names is None else "number"
+                which = (repr(names[k]) if names and names[k] else f"{unnamed} {k}" for k in some)
+                says = "is not in its model" if own is None else "is another number in its model"
+                notes.append(f"put_model: {name} of {', '.join(which)} {says}")
+            fields[name] = (whole if own is None else own).tolist()
+    opt = {name: np.array(getattr(m.opt, name)).tolist() for name in _OPTIONS}
     engine = adapter.Engine(m, acting=True)
     return engine, {"fields": fields, "opt": opt, "labels": labels, "places": engine.joints(), "notes": notes}
 
@@ -74,25 +81,10 @@ def _own(held: Any, name: str, whole: Any) -> Any:
     return own.reshape(whole.shape) if own.size == whole.size and own.dtype != object else None
 
 
-def _notes(m: Any, name: str, whole: Any, own: Any) -> list[str]:
-    """Say which parts of a field the engine does not hold, or holds otherwise."""
-    if own is None:
-        lost, says = np.array(whole, bool), "is not in its model"
-    else:
-        # Beyond single precision.
+def _lost(whole: Any, own: Any) -> Any:
+    """Return the rows of a field that the engine does not hold, or holds otherwise, beyond single precision."""
+    lost = np.array(whole, bool)
+    if own is not None:
         own, whole = own.astype(float), whole.astype(float)
-        lost, says = np.abs(own - whole) > 1e-6 * np.maximum(np.abs(whole), 1e-6), "is another number in its model"
-    kind = name.split("_", maxsplit=1)[0].removesuffix("0")
-    rows: Any = np.flatnonzero(lost.reshape(len(lost), -1).any(axis=1)) if lost.size else []
-    if not len(rows):
-        return []
-    return [f"put_model: {name} of {', '.join(_label(m, kind, int(k)) for k in rows[:6])} {says}"]
-
-
-def _label(m: Any, kind: str, k: int) -> str:
-    if kind == "dof":
-        kind, k = "jnt", int(m.dof_jntid[k])
-    if kind not in _NAMED:
-        return f"coordinate {k}"
-    name = mujoco.mj_id2name(m, getattr(mujoco.mjtObj, "mjOBJ_" + _NAMED[kind]), k)
-    return repr(name) if name else f"number {k}"
+        lost = np.abs(own - whole) > 1e-6 * np.maximum(np.abs(whole), 1e-6)
+    return np.flatnonzero(lost.reshape(len(lost), -1).any(axis=1)) if lost.size else []

@@ -58,11 +58,8 @@ class Imported(Engine):  # type: ignore[misc]  # of the file beside
 
     def described(self, heard: list[str], elements: list[Any]) -> dict[str, Any]:
         """Return the description of the model, with what validation says added to `heard`."""
-        with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always")
-            self._builder.validate_inertia_detailed = True
-            m = self._builder.finalize(device="cpu")
-        checks = [" ".join(str(w.message).split()) for w in said]
+        self._builder.validate_inertia_detailed = True
+        m, checks = _hearing(lambda: self._builder.finalize(device="cpu"))
         found = [_OF_BODY.search(text) for text in checks]
         heard += [text for text, of_body in zip(checks, found, strict=True) if not of_body]
         if names := [*dict.fromkeys(x[1].rsplit("/", maxsplit=1)[-1] for x in found if x)]:
@@ -72,16 +69,19 @@ class Imported(Engine):  # type: ignore[misc]  # of the file beside
 
 def imported(adapter: Any, path: str, format_: str, floating: bool) -> tuple[Any, dict[str, Any]]:  # noqa: ARG001
     """Return the engine of a file that Newton reads, and the description of what it read."""
-    builder, heard = newton.ModelBuilder(), []
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        if format_ == "urdf":
-            builder.add_urdf(path, **({"floating": True} if floating else {}))
-        else:
-            builder.add_mjcf(path)
-    heard += [" ".join(str(w.message).split()) for w in said]
+    builder = newton.ModelBuilder()
+    base = {"floating": True} if floating and format_ == "urdf" else {}
+    _, heard = _hearing(lambda: getattr(builder, "add_" + format_)(path, **base))
     engine = Imported(builder)
     return engine, engine.described(heard, [*ET.parse(path).getroot().iter()])
+
+
+def _hearing(make: Any) -> tuple[Any, list[str]]:
+    """Return what a function gives, and its warnings."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        made = make()
+    return made, [" ".join(str(w.message).split()) for w in said]
 
 
 def _plain(name: str) -> str:
@@ -101,12 +101,11 @@ class _Description:
         self._of = {k: x.numpy().astype(float) for k, x in held.items() if x is not None}
         for some in (x for k, x in self._of.items() if "limit" in _NUMBERS[k]):
             some[np.abs(some) > _NO_LIMIT] *= np.inf
+        sizes = ("joint_q_start", m.joint_coord_count), ("joint_qd_start", m.joint_dof_count)
+        #: Where each joint's coordinates and velocities begin, and the last ones end.
+        self._starts = [[*getattr(m, x).numpy().tolist()[: m.joint_count], n] for x, n in sizes]
         self._drive()
         axes, dims = m.joint_axis.numpy().astype(float), m.joint_dof_dim.numpy()
-        starts = (
-            [*m.joint_q_start.numpy().tolist()[: m.joint_count], m.joint_coord_count],
-            [*m.joint_qd_start.numpy().tolist()[: m.joint_count], m.joint_dof_count],
-        )
         placed = [m.joint_X_p.numpy().astype(float), m.joint_X_c.numpy().astype(float)]
         parents, children = m.joint_parent.numpy(), m.joint_child.numpy()
         masses, coms, inertias = (x.numpy().astype(float) for x in (m.body_mass, m.body_com, m.body_inertia))
@@ -121,7 +120,7 @@ class _Description:
             if child in frames:
                 loops.append(self._label(0, j))
                 continue
-            q, v = (range(s[j], s[j + 1]) for s in starts)
+            q, v = (range(s[j], s[j + 1]) for s in self._starts)
             X = np.linalg.inv(frames[int(parents[j])]) @ _matrix(placed[0][j])
             frames[child], names[child] = _matrix(placed[1][j]), self._name(self._label(1, child))
             steps = self._steps(kind, dims[j], list(q), list(v))
@@ -164,10 +163,8 @@ class _Description:
         if getattr(m, name, None) is None:
             return out
         given = getattr(m, name).numpy().astype(float)
-        starts = [*m.joint_q_start.numpy()[: m.joint_count], m.joint_coord_count]
-        firsts = [*m.joint_qd_start.numpy()[: m.joint_count], m.joint_dof_count]
         for j in range(m.joint_count):
-            q, v = slice(starts[j], starts[j + 1]), slice(firsts[j], firsts[j + 1])
+            q, v = (slice(s[j], s[j + 1]) for s in self._starts)
             if len(given) == len(out):
                 out[v] = given[v]
             elif q.stop - q.start == v.stop - v.start:
