@@ -17,6 +17,8 @@ from mbkit.engines.evaluation import Evaluation
 from mbkit.errors import InputError, MbkitWarning, NumericalError
 from mbkit.model.elements.paths import ALL, Path
 
+#: Words of each error of such a pose: no shorter step helps there.
+AT_SINGULAR_POSE: Final = "at a singular pose"
 #: Least entry, in the unit vector of the smallest singular value, of a row that depends on others.
 TAKES_PART: Final = 0.1
 ASKED: Final = frozenset({"row", "speed"}), "it has no loops and no other constraints (add_loop, or constraints=[...])"
@@ -34,7 +36,7 @@ def singular_pose(who: str, name: str, rows: Sequence[str], J: Array) -> Numeric
     U, sizes, _ = np.linalg.svd(unit_rows(J))
     part = ", ".join(row for row, x in zip(rows, U[:, -1], strict=True) if abs(x) > TAKES_PART)
     return NumericalError(
-        f"{who}: {name} is at a singular pose, where rows depend on each other ({part}; singular values from "
+        f"{who}: {name} is {AT_SINGULAR_POSE}, where rows depend on each other ({part}; singular values from "
         f"{sizes[0]:.2g} down to {sizes[-1]:.2g}): accelerations and forces are not determined there; take a pose "
         "beside it"
     )

@@ -20,7 +20,6 @@ from mbkit._check import CONSISTENT, EPS, ROUNDING, Array
 from mbkit._reproducible import dependent, independent_rows, pivoted, singular_values, under_rows, unit_rows
 from mbkit.derivation.constraints import starts
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, projection
-from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.engines.base import Dynamics, at_time
 from mbkit.engines.constrained import ROWS, singular_pose
 from mbkit.engines.lagrangian import LagrangianDynamics
@@ -43,20 +42,13 @@ def _function(eq: Any, name: str) -> ca.Function:
     """Return a compiled function of (q), (q, v) or (q, v, τ), and the parameters."""
     if name in (projection.__name__, dependence.__name__):
         return {"projection": projection, "dependence": dependence}[name](eq)
-    c, k = eq.constraints, eq.constraints.positions
+    c = eq.constraints
     inputs = {"q": eq.q, "v": eq.v}
     if name == "constraint_rows":
         del inputs["v"]
         outputs = {"f": c.value, "J": c.jacobian}
     elif name == "constraint":
         outputs = {"f": c.value, "J": c.jacobian, "rate": c.rate, "M": eq.mass_matrix}
-    elif name == "constraint_step":
-        # q after a step of Newton's, and v consistent there.
-        space, own = SymbolicSpace(eq.model), eq.constraint_factors
-        moved = -own.change(c.value, k)
-        q1 = space.retract(eq.q, space.to_integrator_velocity(eq.q, moved)) if k else eq.q
-        v1 = eq.v - ca.substitute(own.change(c.rate), eq.q, q1)
-        outputs = {"q1": q1, "v1": v1}
     elif name == "all_rows":
         del inputs["v"]
         every = eq.all_constraints
@@ -223,12 +215,6 @@ class Manifold:
             q1, v1 = np.where(stays, q, q1), np.where(stays, v, v1)
         return q1, v1
 
-    def beside(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return the state after one step of Newton's iteration onto the constraints; at a singular pose as it is."""
-        q1, v1, *_ = self.call("constraint_step", q, v)
-        stays = self.at_pose(q)[..., None]
-        return np.where(stays, q, q1[..., 0]), np.where(stays, v, v1[..., 0])
-
     def dependence(self, q: Array) -> Array:
         """Return how nearly rows of J depend on each other, of one state or each of a batch."""
         return self.call("dependence", q)[0][..., 0, 0]
@@ -240,9 +226,9 @@ class Manifold:
         start and the end may be as far from a pose between them.
         """
         model = self.dyn.model
-        middle = model.integrate(q, 0.5 * model.difference(end, q))
-        start, *others = (self.at(t + c * h).dependence(x) for c, x in ((0.0, q), (0.5, middle), (1.0, end)))
-        near: NDArray[np.bool_] = nears_singular(start, others[0]) | nears_singular(start, others[1])
+        middle = model.integrate(q, 0.5 * model.difference(q, end))
+        places = ((0.0, q), (0.5, middle), (1.0, end))
+        near: NDArray[np.bool_] = nears_singular(*(self.at(t + c * h).dependence(x) for c, x in places))
         return near
 
     def at_pose(self, q: Array) -> NDArray[np.bool_]:

@@ -11,6 +11,7 @@ from math import fsum, prod, sqrt
 from typing import Any, ClassVar, Final
 
 import numpy as np
+from numpy.polynomial import legendre
 from numpy.typing import ArrayLike
 
 from mbkit._check import EPS, ROUNDING, Array
@@ -245,14 +246,16 @@ RK4: Final[Tableau] = _unchecked(
 
 @cache
 def gauss_legendre(stages: int) -> ImplicitTableau:
-    """Return Gauss-Legendre collocation of 2 or 3 stages, of order 4 or 6: the highest for so many stages.
+    """Return Gauss-Legendre collocation, of the highest order for so many stages.
 
     Hairer, Nørsett, Wanner 1993, Solving Ordinary Differential Equations I, II.7.
     """
+    rows: Any
+    weights: Any
     if stages == 2:
         r = sqrt(3) / 6
         rows, weights = [[1 / 4, 1 / 4 - r], [1 / 4 + r, 1 / 4]], [1 / 2, 1 / 2]
-    else:
+    elif stages == 3:
         r = sqrt(15)
         rows = [
             [5 / 36, 2 / 9 - r / 15, 5 / 36 - r / 30],
@@ -260,6 +263,10 @@ def gauss_legendre(stages: int) -> ImplicitTableau:
             [5 / 36 + r / 30, 2 / 9 + r / 15, 5 / 36],
         ]
         weights = [5 / 18, 4 / 9, 5 / 18]
+    else:
+        x, weights = legendre.leggauss(stages)
+        integrals = legendre.legval(x, legendre.legint(np.eye(stages), lbnd=-1, axis=0)).T
+        rows, weights = np.linalg.solve(legendre.legvander(x, stages - 1).T, integrals.T).T / 2, weights / 2
     order = 2 * stages
     out: ImplicitTableau = _unchecked(ImplicitTableau, name=f"gauss{order}", A=rows, b=weights, order=order)
     return out

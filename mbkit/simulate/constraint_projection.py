@@ -2,10 +2,10 @@
 
 The equation of motion holds f̈ = 0 only, so that f and ḟ drift. One-step methods project each step's end, by Newton's
 iteration with the mass matrix as the weight; it moves a state by the step's own error, so that the order stays. Near a
-singular pose f̈ = 0 divides the errors of stages by J's smallest singular value: rk853 projects its stages too, other
-methods with a tolerance leave the way across it to rk853, and fixed steps are those of Gauss's collocation. A
-projection would spoil the history of multistep methods (BDF, LSODA): only their kept states have it. An engine with
-soft constraints projects nothing: how far its states leave the constraints is part of its answer.
+singular pose f̈ = 0 divides the errors of stages by J's smallest singular value: all methods leave the step across it
+to Gauss's collocation, `mbkit.simulate.solvers.gauss.StepNearPose`. A projection would spoil the history of multistep
+methods (BDF, LSODA): only their kept states have it. An engine with soft constraints projects nothing: how far its
+states leave the constraints is part of its answer.
 """
 
 from __future__ import annotations
@@ -48,11 +48,6 @@ def from_consistent(dyn: Dynamics, q: Array, v: Array, t: float) -> tuple[Array,
 def settled(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
     """Return the consistent states near the ends of a step."""
     return manifold_at(dyn, t).pulled(q, v)
-
-
-def beside(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
-    """Return the state after one step of Newton's iteration onto the constraints; at a singular pose as it is."""
-    return manifold_at(dyn, t).beside(q, v)
 
 
 def along_constraints(dyn: Dynamics, outcome: SolverResult) -> SolverResult:

@@ -12,36 +12,33 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import MAX_NAMES, at_times
-from mbkit.engines.constrained import TAKES_PART
+from mbkit.engines.constrained import AT_SINGULAR_POSE, TAKES_PART
 from mbkit.model.validation import listing
 
 if TYPE_CHECKING:
     from mbkit.engines.constraint_manifold import Manifold
 
-#: Tolerance that rk853 may take near a singular pose, where rounding keeps it from a tighter one.
+#: Tightest tolerance of states within a step near a singular pose: f, whose rounding is never zero, is divided by the
+#: distance from the pose. The end of the step is closer.
 LOOSEST: Final = 1e-9
 #: Steps within which a pose is near. At a third of the way a series of the tightest tolerance never arrives.
 AHEAD: Final = 4
-#: Steps' ends that decide on one interval.
+#: Ends of steps that decide on one of them, and the parts of it at which it is looked at too.
 _WINDOW: Final = 4
+_WITHIN: Final = (0.25, 0.5, 0.75)
 #: Largest velocity residual, relative to the rows (1/s), that counts as zero.
 _STILL: Final = 1e-7
 #: Rest of γ at a velocity that stays on a branch to a loose run's digits, relative to its size at any velocity.
 _ON_BRANCH: Final = 1e-5
 #: Difference of times by which J's rate is found, relative to the motion's time scale.
 _APART: Final = 1e-4
-#: Where a step of rk853 has the pose: in the middle of the widest gap between its stages, 1/3 and 0.6.
-_BETWEEN: Final = 7 / 15
-#: Least distance of the end of a step of rk853 from a pose, in lengths of the step.
-_END_DISTANCE: Final = 0.45
 
 
 def manifold_at(dyn: Dynamics, t: float) -> Manifold:
@@ -58,59 +55,23 @@ def _known(dyn: Dynamics, t: float) -> float:
     return min(max(t, first), last)
 
 
-class _Slopes(NamedTuple):
-    """v, J, γ, M and the force of gravity, springs and velocities at a state, and how J and γ change from there.
-
-    J̇ and `gamma_rate` are along the motion with constant velocity; `by_velocity` is ∂γ/∂v.
-    """
-
-    v: Array
-    J: Array
-    gamma: Array
-    M: Array
-    force: Array
-    J_rate: Array
-    gamma_rate: Array
-    by_velocity: Array
-
-
-def _slopes(manifold: Manifold, t: float, q: Array, v: Array) -> _Slopes:
-    model, n = manifold.dyn.model, len(v)
-    apart = _APART / float(np.abs(v).max())
-    # γ is quadratic in v: differences of any length are its derivative.
-    around = float(np.abs(v).max()) * np.eye(n)
-    here = manifold.call("embedded", np.tile(q, (2 * n + 1, 1)), np.array([v, *(v + around), *(v - around)]))
-    J, _, gamma, M, force = (x[0] for x in here)
-    both = []
-    for side in (apart, -apart):
-        J1, _, gamma1, *_ = manifold.at(_known(manifold.dyn, t + side)).call(
-            "embedded", model.integrate(q, side * v), v
-        )
-        both.append((J1, gamma1[:, 0]))
-    (J1, g1), (J0, g0) = both
-    by_velocity = (here[2][1 : n + 1, :, 0] - here[2][n + 1 :, :, 0]).T / (2 * around[0, 0])
-    return _Slopes(v, J, gamma[:, 0], M, force[:, 0], (J1 - J0) / (2 * apart), (g1 - g0) / (2 * apart), by_velocity)
-
-
 class Passage:
-    """A motion at a singular pose: by which rows it is one, why it is not determined there, and its acceleration."""
+    """A motion at a singular pose: by which rows it is one, and why it is not determined there."""
 
     def __init__(self, manifold: Manifold, t: float, q: Array, v: Array) -> None:
-        self._manifold = manifold
         from mbkit.engines.constraint_manifold import AT_POSE
 
+        self._manifold, self._t, self._q, self._v = manifold, t, q, v
         U, sizes, Vt = np.linalg.svd(manifold.jacobian(q))
         rank = min(int(np.count_nonzero(sizes > AT_POSE * sizes[0])), len(U) - 1)
         # Rows that are all zero have no size of their own.
-        self._size = float(sizes[0]) or 1.0
-        self._lost, self._kept = U[:, rank:], U[:, :rank]
-        self._free = Vt[rank:].T
-        self._slopes = _slopes(manifold, t, q, v) if v.any() else None
+        self._lost, self._free = U[:, rank:] / (float(sizes[0]) or 1.0), Vt[rank:].T
 
     @property
     def rows(self) -> list[int]:
         """Which rows depend on each other."""
-        return [int(k) for k in np.flatnonzero(np.abs(self._lost).max(axis=1) > TAKES_PART)]
+        part = np.abs(self._lost).max(axis=1)
+        return [int(k) for k in np.flatnonzero(part > TAKES_PART * np.linalg.norm(self._lost[:, 0]))]
 
     @cached_property
     def undetermined(self) -> str:
@@ -119,58 +80,35 @@ class Passage:
         if not why:
             return ""
         rows = listing([self._manifold.names[k] for k in self.rows], MAX_NAMES)
-        return f"at a singular pose, where {rows} depend on each other, and {why}"
+        return f"{AT_SINGULAR_POSE}, where {rows} depend on each other, and {why}"
 
     def _undetermined(self) -> str:
-        x = self._slopes
-        if x is None:
+        manifold, q, v = self._manifold, self._q, self._v
+        speed, dyn = float(np.abs(v).max()), manifold.dyn
+        if not speed:
             return "at rest there each branch of its motion is as good as another"
-        turning = self._turned(x.J_rate) @ self._free
+        J1, J0 = (
+            manifold.at(_known(dyn, self._t + side)).jacobian(dyn.model.integrate(q, side * v))
+            for side in (_APART / speed, -_APART / speed)
+        )
+        turning = self._lost.T @ (J1 - J0) @ self._free * (speed / (2 * _APART))
         if not np.linalg.svd(turning, compute_uv=False)[-1] > _STILL:
             return "its velocity does not say on which branch it goes on"
-        # γ is quadratic in v, and zero in these rows on a branch.
-        rest = float(np.abs(self._turned(x.gamma)).max())
-        most = float(np.abs(self._turned(x.by_velocity)).sum(axis=1).max()) * float(np.abs(x.v).max())
+        # γ is quadratic in v, and zero in these rows on a branch. Differences of any length are its derivative.
+        around = speed * np.eye(len(v))
+        rates = np.array([v, *(v + around), *(v - around)])
+        here, *others = manifold.call("embedded", np.tile(q, (len(rates), 1)), rates)[2][..., 0] @ self._lost
+        above, below = np.split(np.array(others), 2)
+        rest, most = float(np.abs(here).max()), float(np.abs(above - below).sum(axis=0).max()) / 2
         if not rest <= _ON_BRANCH * most:
             return f"its velocity is off each branch by {rest / most:.1g} of its size"
         return ""
 
-    def acceleration(self, tau: Array) -> Array:
-        """Return v̇ on the branch of the velocity; NaN where it is not determined."""
-        x, n = self._slopes, self._free.shape[0]
-        if x is None or self.undetermined or tau.shape[-1] != n:
-            return np.full(n, np.nan)
-        rows, equations = (
-            np.concatenate([self._kept.T @ x.J / self._size, self._turned(lost)])
-            for lost in (x.J_rate, x.J_rate + x.by_velocity)
-        )
-        right = -np.concatenate([self._kept.T @ x.gamma / self._size, self._turned(x.gamma_rate)])
-        weight = float(np.abs(x.M).max())
-        K = np.block([[x.M / weight, -rows.T], [equations, np.zeros((len(rows), len(rows)))]])
-        given = np.concatenate([(tau + x.force) / weight, right])
-        out: Array = np.linalg.lstsq(K, given, rcond=None)[0][:n]
-        return out
 
-    def _turned(self, x: Array) -> Array:
-        return np.asarray(self._lost.T @ x / self._size)
-
-
-def at_singular_poses(dyn: Dynamics, t: float, q: Array, v: Array, tau: Array) -> tuple[NDArray[np.bool_], Array, str]:
-    """Return which states are at singular poses, v̇ of these, and why one of them has none.
-
-    v̇ is NaN where the motion is not determined and, for now, of all other states.
-    """
-    manifold = manifold_at(dyn, t)
-    which, a, why = manifold.at_pose(q) & np.isfinite(v).all(axis=-1), np.full(v.shape, np.nan), ""
-    if not which.any():
-        return which, a, why
-    for i in map(tuple, np.argwhere(which)):
-        own = manifold.member(i[0]) if i else manifold
-        here = Passage(own, t, q[i], v[i])
-        a[i] = here.acceleration(np.broadcast_to(tau, (*v.shape[:-1], tau.shape[-1]))[i])
-        if here.undetermined:
-            why = f"the motion is {here.undetermined}"
-    return which, a, why
+def undetermined(dyn: Dynamics, t: float, q: Array, v: Array) -> str:
+    """Return why the motion of one state at a singular pose does not go on in one way; empty where it does."""
+    (q,), (v,) = np.atleast_2d(q), np.atleast_2d(v)
+    return Passage(manifold_at(dyn, t).member(0), t, q, v).undetermined
 
 
 class Approach:
@@ -204,24 +142,12 @@ class Approach:
         # A pace that is not known is not above.
         self.near = not (self._distance > AHEAD * h * self._pace).all()
         if self.near and self._unseen is not None:
-            self.ahead, self._unseen = _time_ahead(*self._unseen), None
+            self.ahead, self._unseen = time_ahead(*self._unseen), None
         self.near = self.near and bool((np.abs(self.ahead) <= AHEAD * h).any())
         return self.near
 
-    def length(self, h: float) -> float:
-        """Return the length, up to h, of the next step of rk853 with which no stage comes close to a pose ahead."""
-        d = float(self.ahead)
-        if not 0.02 * h < d < (1 + _END_DISTANCE) * h:
-            return h
-        # A little longer is better than a short step before it.
-        return d / _BETWEEN if d <= 1.05 * _BETWEEN * h else min(h, d - _END_DISTANCE * h)
 
-    def ends_close(self, h: float) -> bool:
-        """Return whether a step of rk853 of this length would end close to a pose."""
-        return bool(abs(float(self.ahead) - h) < _END_DISTANCE * h)
-
-
-def _time_ahead(dyn: Dynamics, t: float, q: Array, v: Array) -> Array:
+def time_ahead(dyn: Dynamics, t: float, q: Array, v: Array) -> Array:
     """Return when J's smallest singular value will be zero at its present rate, s from now; 0 at a singular pose."""
     from mbkit.engines.constraint_manifold import AT_POSE
 
@@ -236,7 +162,7 @@ def _time_ahead(dyn: Dynamics, t: float, q: Array, v: Array) -> Array:
 
 
 class SingularPoses:
-    """The singular poses that one trajectory passes, by how far from one the ends of its steps are.
+    """The singular poses that one trajectory passes, by how far from one it is at and between the ends of its steps.
 
     Through a singular pose this distance, 1/√`dependence`, is smooth once its sign is changed there.
     """
@@ -244,19 +170,36 @@ class SingularPoses:
     def __init__(self, dyn: Dynamics) -> None:
         self._dyn = dyn
         self._seen: list[tuple[float, float, Array]] = []
-        self.times: list[float] = []
+        self._times: list[float] = []
         self._rows: list[int] = []
 
     def began(self, t: float, q: Array) -> None:
         """Take in the start."""
-        if manifold_at(self._dyn, t).at_pose(q):
-            self._passed(t, t, q)
+        self.saw(t, q)
+        self._at_end()
+
+    @property
+    def times(self) -> list[float]:
+        """The times of the poses, up to the last state that was taken in."""
+        # No step follows the last one.
+        self._decide(len(self._seen) - 1)
+        self._at_end()
+        return self._times
+
+    def _at_end(self) -> None:
+        """Keep a pose at which the last state is."""
+        for t, _, q in self._seen[-1:]:
+            if manifold_at(self._dyn, t).at_pose(q) and self._new_since(t):
+                self._passed(t, t, q)
+
+    def _new_since(self, t: float) -> bool:
+        return not self._times or self._times[-1] < t
 
     def _passed(self, t: float, near: float, q: Array) -> None:
         """Keep the time of a pose, and the rows that depend on each other at the state nearest to it."""
         manifold = manifold_at(self._dyn, near)
         self._rows = Passage(manifold, near, q, np.zeros(manifold.dyn.model.nv)).rows
-        self.times.append(t)
+        self._times.append(t)
 
     def saw(self, t: float, q: Array) -> None:
         """Take in the end of a step."""
@@ -272,31 +215,40 @@ class SingularPoses:
 
     def take(self, t: float, dependence: float, q: Array) -> None:
         """Take in the end of a step by the `dependence` of rows there; one that is not finite says nothing."""
-        if dependence != dependence:
-            return
-        self._seen = [*self._seen[1 - _WINDOW :], (t, dependence**-0.5, q)]
-        if len(self._seen) == _WINDOW:
-            self._decide()
+        if dependence == dependence and all(t > before for before, *_ in self._seen[-1:]):
+            self._seen = [*self._seen[1 - _WINDOW :], (t, dependence**-0.5, q)]
+            # The step before is known to both sides.
+            self._decide(len(self._seen) - 2)
 
-    def _decide(self) -> None:
-        times, (s0, s1, s2, s3), q = zip(*self._seen, strict=True)
-        if not (s1 <= s0 and s2 <= s3) or (self.times and self.times[-1] >= times[0]):
+    def _decide(self, k: int) -> None:
+        """Look for a pose in the step that ends at the state k of those that are kept."""
+        if k < 1 or not self._new_since(self._seen[max(k - 2, 0)][0]):
             return
-        if not _bend(times, [s0, s1, -s2, -s3]) < _bend(times, [s0, s1, s2, s3]):
+        t, s, q = (list(x) for x in zip(*self._seen, strict=True))
+        if not (s[k - 1] <= min(s[max(k - 2, 0) : k]) and s[k] <= min(s[k : k + 2])):
             return
-        middle = np.array(times) - times[1]
-        roots = np.roots(np.polyfit(middle, [s0, s1, -s2, -s3], 3))
-        within = roots[np.isreal(roots) & (roots.real >= 0) & (roots.real <= middle[2])].real
-        if len(within):
-            nearest = 1 if s1 < s2 else 2
-            self._passed(times[1] + float(within[0]), times[nearest], q[nearest])
+        model, h = self._dyn.model, t[k] - t[k - 1]
+        way = model.difference(q[k - 1], q[k])
+        inner = [t[k - 1] + part * h for part in _WITHIN]
+        places = [model.integrate(q[k - 1], part * way) for part in _WITHIN]
+        depends = [float(manifold_at(self._dyn, x).dependence(y)) for x, y in zip(inner, places, strict=True)]
+        times, sizes = [*t[:k], *inner, *t[k:]], np.array([*s[:k], *np.power(depends, -0.5), *s[k:]])
+        turned = (
+            _bend(times, np.where(np.arange(len(sizes)) < i, sizes, -sizes)) for i in range(k, k + len(inner) + 1)
+        )
+        if min(turned) < _bend(times, sizes):
+            signed = np.where(np.arange(len(s)) < k, s, np.negative(s))
+            roots = np.roots(np.polyfit(np.array(t) - t[k - 1], signed, len(s) - 1))
+            within = roots[np.isreal(roots) & (roots.real >= 0) & (roots.real <= h)].real
+            nearest = k - 1 if s[k - 1] < s[k] else k
+            self._passed(t[k - 1] + float(within[0]) if len(within) else t[nearest], t[nearest], q[nearest])
 
     def describe(self, tolerance: bool) -> str:
         """Return the poses in a sentence, for a method with or without a tolerance; empty where there are none."""
-        if not self.times:
+        if not (times := self.times):
             return ""
-        when = ", ".join(f"{t:.4g}" for t in self.times[:3]) + (" and later" if len(self.times) > 3 else "")
-        names = manifold_at(self._dyn, self.times[0]).names
+        when = ", ".join(f"{t:.4g}" for t in times[:3]) + (" and later" if len(times) > 3 else "")
+        names = manifold_at(self._dyn, times[0]).names
         rows = " and ".join(names[k] for k in self._rows)
         error = f"; a step there may be off by {LOOSEST:g} whatever the tolerance" if tolerance else ""
         return (

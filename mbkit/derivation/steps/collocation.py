@@ -238,7 +238,8 @@ class Collocation:
         q1, w1, lost = space.retract(s["q"], u), s["w"] + dw, ca.SX(0.0)
         if self._rows:
             depends = dependence(eq)
-            near = nears_singular(depends(s["q"], *extra), depends(q1, *behind))
+            middle = space.retract(s["q"], 0.5 * u), *at_time(eq, 0.5 * s["dt"]).values()
+            near = nears_singular(*(depends(*x) for x in ((s["q"], *extra), middle, (q1, *behind))))
             q1, v1, far = thorough_projection(eq)(q1, space.to_body_velocity(q1, w1), *behind)
             w1, lost = space.to_integrator_velocity(q1, v1), ca.logic_or(far, near)
         misses = s["misses"] + s["miss"] + ca.logic_or(lost, is_lost(q1, w1))

@@ -4,8 +4,8 @@ The formulas are those of `mbkit.methods`, on the space of `mbkit.model.integrat
 the step.
 
 Under constraints the stages are those of the method, and the end is projected as in
-`mbkit.derivation.steps.onto_constraints`. Its first stage and its last one, or its end where no stage is there, tell
-whether a step is near a singular pose (`nears_singular`). Such a step is lost here, and taken by
+`mbkit.derivation.steps.onto_constraints`. Its stages, and its end and its middle where no stage is there, tell whether
+a step is near a singular pose (`nears_singular`). Such a step is lost here, and taken by
 `mbkit.simulate.solvers.fixed_step.make_step`, by collocation.
 """
 
@@ -36,6 +36,8 @@ _MARCHED: Final = ("q1", "w1", "squares1")
 #: Number of operations of all stages above which the forward dynamics is compiled once and called for each of them:
 #: LLVM's time grows faster than the step, which then runs no faster than its parts.
 _MAX_OPERATIONS_IN_ONE_PIECE: Final = 20_000
+#: Fewest stages of a method that has one within the step, from which a pose is seen that both ends are as far from.
+_MIN_STAGES_WITH_INNER: Final = 3
 #: The numbers of a state feedback.
 LAW: Final = "law"
 #: Names that a march hands on from step to step.
@@ -204,12 +206,16 @@ def march_in_stages(equations: Equations, method: str, *, thorough: bool = False
     lost: Any = 0.0
     if held:
         behind, v1 = at_time(equations, s["dt"]).values(), space.to_body_velocity(q1, w1)
-        end = dependences[-1] if formula.ends_at_a_stage else dependence(equations)(q1, *behind)
+        if not formula.ends_at_a_stage:
+            dependences.append(dependence(equations)(q1, *behind))
+        if formula.stages < _MIN_STAGES_WITH_INNER:
+            middle = space.retract(s["q"], 0.5 * s["dt"] * w1), *at_time(equations, 0.5 * s["dt"]).values()
+            dependences.append(dependence(equations)(*middle))
         if thorough or not formula.ends_at_a_stage:
             q1, v1, far = thorough_projection(equations)(q1, v1, *behind)
         else:
             q1, v1, far = quick_projection(equations)(q1, v1, last, *behind)
-        w1, lost = space.to_integrator_velocity(q1, v1), ca.logic_or(far, nears_singular(dependences[0], end))
+        w1, lost = space.to_integrator_velocity(q1, v1), ca.logic_or(far, nears_singular(*dependences))
     # Infinite where it is lost.
     squares = s["squares"] + (ca.sumsqr(q1) + ca.sumsqr(w1)) + lost / (1 - lost)
     results = dict(zip(_MARCHED, (q1, w1, squares), strict=True))

@@ -152,11 +152,12 @@ def _largest(equations: Any) -> list[float]:
     return [float(x) for x in np.nanmax(values, axis=0)]
 
 
-def nears_singular(before: Any, behind: Any) -> Any:
+def nears_singular(before: Any, *behind: Any) -> Any:
     """Return 1 where a step that changes the `dependence` so would meet a singular pose within a few more of its kind.
 
+    It is known at the start, and behind it at the end and between: the ends may be as far from a pose in the middle.
     With r = 1/√dependence, as far from such a pose: r1 < n abs(r1 - r0), or r1 > n/(n - 1) r0, or r1 < n/(n + 1) r0.
     """
     nearer, farther = (_STEPS_AHEAD + 1) ** 2 / _STEPS_AHEAD**2, (_STEPS_AHEAD - 1) ** 2 / _STEPS_AHEAD**2
     # A sum, which NumPy and CasADi both know.
-    return (behind > nearer * before) + (behind < farther * before) > 0
+    return sum((x > nearer * before) + (x < farther * before) for x in behind) > 0

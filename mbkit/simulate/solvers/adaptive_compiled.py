@@ -1,7 +1,7 @@
 """The embedded step as machine code: many attempts in a row without going back to Python.
 
-Near a singular pose the stages have to be projected: there a trajectory steps in Python, from a few steps before, until
-the pose is behind it.
+Near a singular pose steps are of collocation: there a trajectory steps in Python, from a few steps before, until the
+pose is behind it.
 """
 
 from __future__ import annotations

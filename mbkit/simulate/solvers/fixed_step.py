@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,15 @@ from mbkit.methods.tableaus import ImplicitTableau, Tableau
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.singular_poses import LOOSEST, SingularPosesOfBatch, manifold_at
+from mbkit.simulate.singular_poses import SingularPosesOfBatch, manifold_at
 from mbkit.simulate.solvers.gauss import CollocationStep, StepNearPose
 from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.solvers.vector_field import ALL, DIVERGED, DivergenceError, Field, are_bounded
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
 
+#: Stages of a fixed step near a singular pose, for order 8.
+STAGES_NEAR_POSE: Final = 4
 #: step(t, h, q, w, force) -> (q, w) at t + h; one state or a batch
 Step = Callable[[float, float, Array, Array, Force], tuple[Array, Array]]
 
@@ -89,9 +91,6 @@ class _FieldStepper(Stepper):
         if self.poses is not None:
             self.poses.saw(self.field.dyn, t, np.atleast_2d(q), self._members)
         return q, w
-
-    def reason(self, q: Array, w: Array) -> str:
-        return self.field.undetermined or super().reason(q, w)
 
     def to_body_velocity(self, q: Array, w: Array) -> Array:
         return np.asarray(self.space.to_body_velocity(q, w))
@@ -242,10 +241,9 @@ def make_step(method: str, field: Field, space: Space) -> Step:
     else:
         assert isinstance(formula, (Tableau, SemiImplicitEuler))
         attempt = _ExplicitStep(formula, field, space)
-    near_pose = StepNearPose(field, space, LOOSEST)
+    near_pose = StepNearPose(field, space, STAGES_NEAR_POSE)
 
     def step(t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
-        field.near = False
         if not field.projects:
             return attempt(t, h, q, w, force)
         try:
@@ -258,8 +256,17 @@ def make_step(method: str, field: Field, space: Space) -> Step:
         near = manifold_at(field.dyn, t).nears_pose(t, q, h, q1)
         if not near.any():
             return q1, w1
-        careful = near_pose(t, h, q, w, force)
-        return np.where(near[..., None], careful[0], q1), np.where(near[..., None], careful[1], w1)
+        if near.size == 1:
+            return near_pose(t, h, q, w, force)
+        if not isinstance(force, np.ndarray):
+            raise DivergenceError
+        for i in np.flatnonzero(near):
+            own = Field(field.dyn._of_samples([i]), space)
+            q1[i], w1[i] = StepNearPose(own, space, STAGES_NEAR_POSE)(
+                t, h, q[i], w[i], force if force.ndim == 1 else force[i]
+            )
+            field.evaluations += own.evaluations
+        return q1, w1
 
     return step
 

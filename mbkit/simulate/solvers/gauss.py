@@ -7,16 +7,17 @@ on (q, v) as here.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import sqrt
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from mbkit._check import EPS, Array
 from mbkit.methods.tableaus import ImplicitTableau, extrapolation_weights, gauss_legendre
 from mbkit.model.integration_space import Space
+from mbkit.simulate.singular_poses import LOOSEST, time_ahead, undetermined
 from mbkit.simulate.solvers.vector_field import DIVERGED, DivergenceError, Field
 from mbkit.simulate.torque import Force
 
@@ -32,10 +33,14 @@ _MAX_VELOCITY_ROUNDING: Final = 1e-11
 _MAX_MOVE_ROUNDING: Final = 1e-13
 #: Largest difference of two times that are one, in steps.
 _MAX_TIME_ROUNDING: Final = 1e-9
-#: Most times that a step near a singular pose is split in two, and the length of the first part in steps: a pose at a
-#: stage of Gauss's three is at none of either part.
-_MAX_SPLITS: Final = 4
-_FIRST_PART: Final = 0.4
+#: Difference of states by which slopes near a singular pose are found, relative to the way of the step.
+_DIFFERENCE_NEAR_POSE: Final = 1e-4
+#: Distance of a pose from the start of a step, in its lengths, up to which it is at the start: behind it are all stages
+#: but one. One that is farther has to be in the middle, as at most other places f̈ = 0 at the stages leaves the
+#: distance from the constraints open, and most of all near the end.
+AT_START: Final = 0.05
+#: Distance of a pose from the start in lengths of the step from which it is far behind the end.
+AT_END: Final = 1.5
 _UNSOLVED: Final = "the iteration does not solve the equations of the step's stages"
 
 
@@ -64,25 +69,28 @@ class CollocationStep:
     The unknowns are the stages' rates (u̇, ẇ) side by side, (stages, ..., 2 nv).
     """
 
-    def __init__(
-        self, tableau: ImplicitTableau, field: Field, space: Space, rounding: float = _MAX_VELOCITY_ROUNDING
-    ) -> None:
+    def __init__(self, tableau: ImplicitTableau, field: Field, space: Space, *, near_pose: bool = False) -> None:
         self._A, self._b, self._c, self._s = tableau.A, tableau.b, tableau.c, tableau.stages
         self._times = tableau.c.tolist()
-        self._field, self._space, self._nv, self._rounding = field, space, space.nv, rounding
+        self._field, self._space, self._nv, self._near_pose = field, space, space.nv, near_pose
+        self._rounding = LOOSEST if near_pose else _MAX_VELOCITY_ROUNDING
         # The last step, and the one before, from which it may be tried again.
         self._past: list[_Past] = []
 
     def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
         """Return q and w after a step of h seconds."""
+        rates = self.rates(t, h, q, w, force)
+        moved = _mixed(h * self._b, rates)
+        return self._space.retract(q, moved[..., : self._nv]), w + moved[..., self._nv :]
+
+    def rates(self, t: float, h: float, q: Array, w: Array, force: Force) -> Array:
+        """Return the stages' rates of such a step, (stages, ..., 2 nv)."""
         start = _Start(t, h, q, w, force)
         near = (x for x in self._past if abs(x.end - t) < _MAX_TIME_ROUNDING * h)
         past = next((x for x in near if x.rates.shape[1:] == w.shape), None)
         rates, inverse = self._solved(start, self._guess(start, past), past.inverse if past and past.h == h else None)
-        moved = _mixed(h * self._b, rates)
-        q1 = self._space.retract(q, moved[..., : self._nv])
         self._past = [_Past(t + h, rates[..., self._nv :], h, inverse), *([] if past is None else [past])]
-        return q1, w + moved[..., self._nv :]
+        return rates
 
     def _guess(self, start: _Start, past: _Past | None) -> Array:
         # The polynomial through the last step's ẇ is continued; a first step has the ẇ at its start.
@@ -91,7 +99,7 @@ class CollocationStep:
         if past is not None:
             weights = extrapolation_weights(self._times, 1 + start.h / past.h * self._c)
             rates[..., nv:] = _mixed(weights, past.rates)
-        else:
+        elif not self._near_pose:
             rates[..., nv:] = self._field(start.t, start.q, w, start.force)
         rates[..., :nv] = w + _mixed(start.h * self._A, rates[..., nv:])
         return rates
@@ -101,8 +109,10 @@ class CollocationStep:
 
         Plain iteration, or a matrix of an earlier step, gives way to the matrix at the start of this one, and
         that to one of every iterate, with the derivatives at its stages: where a stiff direction turns during
-        the step, no other leads there.
+        the step, no other leads there, and none near a singular pose.
         """
+        if self._near_pose:
+            return self._newton(start, guess), None
         try:
             return self._iterated(start, guess, inverse)
         except DivergenceError as error:
@@ -194,7 +204,10 @@ class CollocationStep:
     def _slopes(self, start: _Start, c: float, u: Array, w: Array) -> Array:
         """Return J = ∂(u̇, ẇ)/∂(u, w) by differences: half of the digits are enough for the iteration."""
         nv = self._nv
-        size = sqrt(EPS) * max(1.0, float(np.abs(w).max(initial=0.0)))
+        speed = float(np.abs(w).max(initial=0.0))
+        size = sqrt(EPS) * max(1.0, speed)
+        if self._near_pose and speed:
+            size = min(size, _DIFFERENCE_NEAR_POSE * start.h * speed)
         J = np.empty((*w.shape[:-1], 2 * nv, 2 * nv))
         there, moved = np.empty(J.shape[:-1]), np.empty(J.shape[:-1])
         y = np.concatenate([u, w], axis=-1)
@@ -207,51 +220,67 @@ class CollocationStep:
         return J
 
 
-class StepNearPose:
-    """A step near a singular pose, of one state or a batch: of Gauss's collocation of order 6, or parts of such a step.
+class StepPolynomial:
+    """The states within a step of collocation, by the polynomials of its stages' rates.
 
-    f̈ = 0 divides the stages' distance from the constraints by J's smallest singular value. Those of collocation are
-    close to the motion, and none is at an end, which may be the pose. `rounding` is the part of the velocity that is
-    rounding in the stages, where the same divides it; the end of a step is off by far less.
+    Attributes
+    ----------
+    t, h : float
+        Where it starts, and its length, s.
+    last : (..., nv) array
+        Size of the last term in u: the error of places within the step. Those of its end are of twice the order.
     """
 
-    def __init__(self, field: Field, space: Space, rounding: float) -> None:
-        self._field, self._collocation = field, CollocationStep(gauss_legendre(3), field, space, rounding)
-        self._rounding = rounding
+    def __init__(self, space: Space, times: Array, start: _Start, rates: Array) -> None:
+        self._space, self._start, self.t, self.h = space, start, start.t, start.h
+        terms = _mixed(np.asarray(np.linalg.inv(legendre.legvander(2 * times - 1, len(times) - 1)), float), rates)
+        self._moved = legendre.legint(terms, lbnd=-1, scl=self.h / 2)
+        self.last = self.h * np.abs(terms[-1, ..., : space.nv])
 
-    def __call__(
-        self, t: float, h: float, q: Array, w: Array, force: Force, splits: int = _MAX_SPLITS
-    ) -> tuple[Array, Array]:
-        """Return q and w after a step of h seconds, in parts where a stage comes close to the pose."""
-        near, self._field.near = self._field.near, True
-        try:
-            return self._collocation(t, h, q, w, force)
-        except DivergenceError:
-            # Each member of a batch is then asked by itself.
-            if not splits or q.size > q.shape[-1]:
-                raise
-        finally:
-            self._field.near = near
-        return self._parts(self, t, h, q, w, force, splits - 1)
+    def at(self, t: float) -> tuple[Array, Array]:
+        """Return q and w at a time within the step."""
+        u, w = np.split(legendre.legval(2 * (t - self.t) / self.h - 1, self._moved), 2, axis=-1)
+        return self._space.retract(self._start.q, u), self._start.w + w
 
-    def to_tolerance(
-        self, t: float, h: float, q: Array, w: Array, force: Force, splits: int = _MAX_SPLITS
-    ) -> tuple[Array, Array]:
-        """Return q and w after h seconds, in parts until those of a part agree with the whole of it."""
-        whole, parts = self(t, h, q, w, force), self._parts(self, t, h, q, w, force, _MAX_SPLITS)
-        if all((np.abs(x - y) < self._rounding * (1 + np.abs(y))).all() for x, y in zip(whole, parts, strict=True)):
-            return parts
-        if not splits:
-            raise DivergenceError(_UNSOLVED)
-        return self._parts(self.to_tolerance, t, h, q, w, force, splits - 1)
 
-    def _parts(
-        self, step: Callable[..., Any], t: float, h: float, q: Array, w: Array, force: Force, splits: int
-    ) -> tuple[Array, Array]:
-        first = _FIRST_PART * h
-        q, w = self._field.settled(t + first, *step(t, first, q, w, force, splits))
-        end: tuple[Array, Array] = step(t + first, h - first, q, w, force, splits)
-        return end
+class StepNearPose:
+    """Steps near a singular pose: of Gauss's collocation, with a pose within one in the middle of it.
+
+    f̈ = 0 divides the stages' distance from the constraints by J's smallest singular value. Those of collocation are
+    close to the motion, none is at an end, which may be the pose, and none of an even number is in the middle.
+    """
+
+    def __init__(self, field: Field, space: Space, stages: int) -> None:
+        tableau = gauss_legendre(stages)
+        self._field, self._space, self._times = field, space, tableau.c
+        self._collocation = CollocationStep(tableau, field, space, near_pose=True)
+
+    def part(
+        self, t: float, h: float, stop: float, q: Array, w: Array, force: Force, reach: float = 1.0
+    ) -> tuple[float, StepPolynomial]:
+        """Return a step of one state over about h seconds, and its end, which is not behind the stop.
+
+        Its polynomial may be `reach` times as long, and longer where a pose is near its end.
+        """
+        v = self._space.to_body_velocity(q, w)
+        ahead = float(np.ravel(time_ahead(self._field.dyn, t, q, v))[0])
+        if not ahead and (why := undetermined(self._field.dyn, t, q, v)):
+            raise DivergenceError(f"the motion is {why}")
+        if 0 < ahead < AT_END * h:
+            h *= reach
+            h = h if ahead <= AT_START * h else 2 * ahead
+        rates = self._collocation.rates(t, h, q, w, force)
+        return min(t + h, stop), StepPolynomial(self._space, self._times, _Start(t, h, q, w, force), rates)
+
+    def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
+        """Return q and w of one state after h seconds."""
+        end = t + h
+        while True:
+            t, step = self.part(t, end - t, end, q, w, force)
+            q, w = step.at(t)
+            if not t < end:
+                return q, w
+            q, w = self._field.settled(t, q, w)
 
 
 def _inverse_of(coupled: Array) -> Array:

@@ -31,9 +31,10 @@ from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
 from mbkit.simulate.singular_poses import SingularPosesOfBatch
-from mbkit.simulate.solvers.fixed_step import SteppedRun, Stepper
+from mbkit.simulate.solvers.fixed_step import STAGES_NEAR_POSE, SteppedRun, Stepper
+from mbkit.simulate.solvers.gauss import StepNearPose
 from mbkit.simulate.solvers.trajectory_record import GridRecord
-from mbkit.simulate.solvers.vector_field import BOUND, DIVERGED
+from mbkit.simulate.solvers.vector_field import BOUND, DIVERGED, DivergenceError, Field, are_bounded
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
 
@@ -53,6 +54,7 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
     midpoint, q0 = midpoint_of(dyn), problem.q
     w0 = np.zeros((len(q0), midpoint.unknowns))
     w0[:, : dyn.model.nv] = Space(dyn.model).to_integrator_velocity(q0, problem.v)
+    iterations = 0
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         (pi0,) = called(dyn, midpoint.momentum, None, problem.start, q0, problem.v)
         if _machine_code(dyn, midpoint, problem):
@@ -63,15 +65,19 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
                 return _velocities(dyn, midpoint, members, t, q, pi)
 
             record, iterations, lost = run_implicit(problem, midpoint, pi0, w0, velocity)
+            # A step from or to a singular pose is one of Python, and so are all others of its trajectory.
+            members: Indices | None = np.array(sorted(lost) if dyn._projects else [], dtype=np.intp)
 
             def why(i: int) -> str:
                 return _reason(*lost[i])
 
         else:
+            record, members = GridRecord(problem), None
+        if members is None or len(members):
             stepper = MidpointStepper(dyn, problem, w0)
-            run = SteppedRun(problem, stepper, pi0[0] if problem.batch is None else pi0)
+            run = SteppedRun(problem, stepper, pi0[0] if problem.batch is None else pi0, record, members)
             run.to_end()
-            record, iterations = run.record, stepper.iterations
+            iterations += stepper.iterations
 
             def why(i: int) -> str:  # noqa: ARG001  # of a batch the first one's
                 return run.why
@@ -142,18 +148,19 @@ class MidpointStepper(Stepper):
         self._members: Indices = np.arange(len(w0))
         # The velocities of the last steps, and the first guess of the next one.
         self._last, self._guess = [w0] * len(GUESS_WEIGHTS), w0
-        self.iterations = 0
+        self.iterations, self._why = 0, ""
 
     def only(self, members: Indices, good: NDArray[np.bool_] | None = None) -> None:
+        which = members if good is None else good
         self._members = members
-        self._last, self._guess = [w[good] for w in self._last], self._guess[good]
+        self._last, self._guess = [w[which] for w in self._last], self._guess[which]
 
     def velocity(self, t: float, q: Array, w: Array) -> Array:
         both = np.atleast_2d(q), np.atleast_2d(w)
         return _velocities(self._dyn, self._midpoint, self._members, t, *both).reshape(w.shape)
 
     def reason(self, q: Array, w: Array) -> str:
-        return _reason(q, w)
+        return self._why or _reason(q, w)
 
     def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
         q, pi = np.atleast_2d(q), np.atleast_2d(w)
@@ -164,7 +171,31 @@ class MidpointStepper(Stepper):
         args = q, pi, *self._last, tau, step, zero, zero
         q1, pi1, self._guess, _ = called(self._dyn, self._midpoint.end, members, middle, *args)
         q1[~good] = np.nan
+        for i in np.flatnonzero(~are_bounded(q1, pi1)).tolist() if self._dyn._projects else ():
+            q1[i], pi1[i], w = self._from_or_to_pose(i, t, h, q[i], pi[i], tau[i])
+            for rows in (*self._last, self._guess):
+                rows[i], rows[i, : len(w)] = 0.0, w
         return (q1[0], pi1[0]) if self._single else (q1, pi1)
+
+    def _from_or_to_pose(
+        self, i: int, t: float, h: float, q: Array, pi: Array, tau: Array
+    ) -> tuple[Array, Array, Array]:
+        """Return q, π and w of one trajectory after a step that starts or ends in a singular pose; NaN without one.
+
+        J0ᵀ λ leads to no end from there, nor J1ᵀ κ to a velocity: such a step is of collocation.
+        """
+        members = self._members[[i]]
+        field = Field(self._dyn._of_samples(members), self._space)
+        (v,) = _velocities(self._dyn, self._midpoint, members, t, q[None], pi[None])
+        try:
+            step = StepNearPose(field, self._space, STAGES_NEAR_POSE)
+            q1, w1 = field.settled(t + h, *step(t, h, q, self._space.to_integrator_velocity(q, v), tau))
+        except DivergenceError as error:
+            self._why = str(error)
+            return np.full(q.shape, np.nan), pi, np.zeros(v.shape)
+        v1 = self._space.to_body_velocity(q1, w1)
+        ((pi1,),) = called(self._dyn, self._midpoint.momentum, members, t + h, q1[None], v1[None])
+        return q1, pi1, w1
 
     def _velocity(self, t: float, h: float, q: Array, pi: Array, force: Force) -> tuple[Array, Array, Any]:
         """Return the velocity of a step, the torque that acted, and whether the step is solved, per trajectory.
@@ -239,6 +270,9 @@ def _velocities(
 ) -> Array:
     """Return the velocities of states (n, nq) and (n, nv) in positions and momenta."""
     if _written_out(dyn):
-        return called(dyn, midpoint.velocity, members, t, q, pi)[0]
+        (v,) = called(dyn, midpoint.velocity, members, t, q, pi)
+        # At a singular pose its rows ask for no velocity; that of a momentum on them satisfies them.
+        if not dyn._projects or np.isfinite(v).all():
+            return v
     M, p = called(dyn, midpoint.velocity_system, members, t, q, pi)
     return np.asarray(np.linalg.solve(M, p[..., None])[..., 0])

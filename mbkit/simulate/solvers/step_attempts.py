@@ -33,7 +33,7 @@ from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.diagnostics.stiffness import RateJacobian
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.singular_poses import AHEAD, LOOSEST, Approach
-from mbkit.simulate.solvers.gauss import StepNearPose
+from mbkit.simulate.solvers.gauss import AT_END, AT_START, StepNearPose, StepPolynomial
 from mbkit.simulate.solvers.trajectory_record import AcceptedSteps, StoppedError, below_rounding, diverged
 from mbkit.simulate.solvers.vector_field import DivergenceError, Field, Rates
 from mbkit.simulate.torque import Force
@@ -81,10 +81,8 @@ class StepAttempts(Protocol):
         """Return (q, w) at times, (m, nq) and (m, nv), each by one step from the state of the same row."""
 
 
-#: Tightest tolerance of a step across a singular pose, which rounding lets a step of rk853 hold.
-_MIN_RTOL_ACROSS_POSE: Final = 1e-13
-#: Part of the velocity that is rounding in stages of collocation at the shortest distance of a stop from a pose.
-_STAGES_NEAR_POSE: Final = 1e-7
+#: Stages of an adaptive step near a singular pose: its error grows as that of rk853.
+_STAGES_NEAR_POSE: Final = 8
 
 
 class RungeKuttaAttempts:
@@ -105,8 +103,8 @@ class RungeKuttaAttempts:
         self._force: Force = np.zeros(space.nv)
         self._h = self._t = self._stop = 0.0
         self._why, self._near_pose = "", StepNearPose(self._field, space, _STAGES_NEAR_POSE)
-        #: Factor of the tolerance.
-        self._slack = 1.0
+        #: The states within the last step, if it was near a singular pose.
+        self._within_last: StepPolynomial | None = None
 
     @property
     def evaluations(self) -> int:
@@ -159,64 +157,38 @@ class RungeKuttaAttempts:
 
     def _first(self) -> float:
         def probe(q: Array, w: Array) -> Array:
-            return self._field(self._t, q[0], w[0], self._force)[None]
+            try:
+                return self._field(self._t, q[0], w[0], self._force)[None]
+            except DivergenceError:
+                # At a singular pose there is a motion, and no rate.
+                return np.zeros(w.shape)
 
         q, w = self._q[None], self._w[None]
-        try:
-            h = float(first_length(self._space, q, w, probe(q, w), self._tolerances, probe, self.grows)[0])
-        except DivergenceError:
-            h = math.nan
+        h = float(first_length(self._space, q, w, probe(q, w), self._tolerances, probe, self.grows)[0])
         # The step finds out where there is no rate; at the least length no step would be tried.
         return max(h if h > 0 else 1e-6 * (self._stop - self._t), 2 * self._least)
 
     def advance(self) -> list[tuple[int, AcceptedSteps]]:
         if self._dropped or self._t >= self._stop or self.stuck(0) is not None:
             return []
-        approach, length = self._field.approach, self._h
-        if approach.crosses(length):
-            rest = self._stop - self._t
-            if rest <= length and approach.ends_close(rest) and (end := self._near_pose_to(self._stop)) is not None:
-                return [(0, end)]
-            # A step that is to end behind the pose may not come close to it with its end.
-            length = approach.length(min(length, rest))
-        t = end_of_attempt(SCALARS, self._t, length, self._stop)
-        step = t - self._t
-        ends = [(self._t, self._q, self._w)]
-        q, w, self._error = self._checked_attempt(step)
+        end = end_of_attempt(SCALARS, self._t, self._h, self._stop)
+        step = end - self._t
+        start, self._within_last = (self._t, self._q, self._w), None
+        near = self._field.approach.crosses(self._h) and abs(float(self.approach.ahead)) < AT_END * self._reach * step
+        end, q, w, self._error = self._checked_attempt(end, self._attempt_near_pose if near else self._attempt)
         good = self._error < 1 and step > 0
-        if not good and self._loosest and self._field.near_singular and (end := self._near_pose_to(t)) is not None:
-            return [(0, end)]
         self._settle(step, good)
-        if good:
-            ends.append(self._arrive(t, q, w))
-        return [(0, _accepted(*ends))]
+        if near and not good and self.approach.ahead > AT_START * self._reach * step:
+            # To beside the pose: a shorter step to behind it would be of the same polynomial.
+            self._h = min(self._h, float(self.approach.ahead) / AT_END)
+        return [(0, _accepted(start, self._arrive(end, q, w)) if good else _accepted(start))]
 
     def _arrive(self, t: float, q: Array, w: Array) -> tuple[float, Array, Array]:
         q, w = self._field.settled(t, q, w)
         self._t, self._q, self._w, self._fresh = t, q, w, True
         return t, q, w
 
-    def _near_pose_to(self, t: float) -> AcceptedSteps | None:
-        """Go on to a time without stages at the ends, one of which is close to a pose; None where that fails."""
-        start = self._t, self._q, self._w
-        try:
-            end = self._near_pose.to_tolerance(self._t, t - self._t, self._q, self._w, self._force)
-        except DivergenceError:
-            return None
-        self._error, self._slack = 0.0, 1.0
-        return _accepted(start, self._arrive(t, *end))
-
-    @property
-    def _loosest(self) -> bool:
-        return self._slack * self._tolerances.rtol >= LOOSEST
-
     def _settle(self, step: float, good: bool) -> None:
-        if self._error >= 1 and not self._loosest and self._field.near_singular:
-            # Near a singular pose shorter steps are no better: their stages are nearer to it, and rounding grows.
-            across = 0 < self._field.approach.ahead < step
-            self._slack, self._h, self._most = 10 * self._slack, self._h if across else 0.8 * self._h, 1.0
-            return
-        self._slack = 1.0 if good else self._slack
         factors = self._factors(SCALARS, np.float64(self._error if self._error >= 0 else math.nan), self._last)
         # A step of no length, far from the time's zero, ends the run.
         h, self._most, self._last = next_step(
@@ -224,24 +196,45 @@ class RungeKuttaAttempts:
         )
         self._h = float(h)
 
-    def _checked_attempt(self, step: float) -> tuple[Array, Array, float]:
+    def _checked_attempt(
+        self, end: float, attempt: Callable[[float], tuple[float, Array, Array, float]]
+    ) -> tuple[float, Array, Array, float]:
         try:
-            end = self._attempt(step)
+            state = attempt(end)
         except DivergenceError as error:
             self._why, self._fresh = str(error), True
-            return self._q, self._w, math.nan
-        self._why, self._fresh = "", False
-        return end
+            return end, self._q, self._w, math.nan
+        self._why = ""
+        return state
 
-    def _attempt(self, step: float) -> tuple[Array, Array, float]:
-        """Return q and w after a step, and its error in units of the tolerance."""
+    def _attempt(self, end: float) -> tuple[float, Array, Array, float]:
+        """Return the end of a step, q and w there, and its error in units of the tolerance."""
+        step = end - self._t
         q, w, u = self._step(self._t, self._q, self._w, step, fresh=self._fresh)
-        least = _MIN_RTOL_ACROSS_POSE if self._field.near_singular else 0.0
+        self._fresh = False
+        scales = self._scales(q, w, u)
+        error = embedded_error(SCALARS, self._tableau.errors, self._stages, scales, step, 2 * self._space.nv)
+        return end, q, w, float(error)
+
+    def _attempt_near_pose(self, end: float) -> tuple[float, Array, Array, float]:
+        start = self._q, self._w, self._force
+        end, part = self._near_pose.part(self._t, end - self._t, self._stop, *start, self._reach)
+        q, w = part.at(end)
+        self._within_last, self._fresh = part, True
+        by_u, _ = self._scales(q, w, part.last, LOOSEST)
+        return end, q, w, float((part.last / by_u).max(initial=0.0))
+
+    @property
+    def _reach(self) -> float:
+        """Length of a step near a pose, in those of rk853, as its tolerance may be the looser one."""
+        return float(max(1.0, LOOSEST / self._tolerances.rtol) ** (1 / self.grows))
+
+    def _scales(self, q: Array, w: Array, u: Array, least: float = 0.0) -> tuple[Array, Array]:
+        """Return the tolerated errors of u and of w in a step that moves q by u, by tolerances of at least so much."""
         space, (rtol, atol) = self._space, (max(x, least) for x in self._tolerances)
         sizes = np.maximum(space.magnitude(self._q, u), space.magnitude(q, u)), np.maximum(np.abs(self._w), np.abs(w))
-        by_u, by_w = (self._slack * (atol + rtol * x) for x in sizes)
-        error = embedded_error(SCALARS, self._tableau.errors, self._stages, (by_u, by_w), step, 2 * space.nv)
-        return q, w, float(error)
+        by_u, by_w = (atol + rtol * x for x in sizes)
+        return by_u, by_w
 
     def _step(self, t: float, q: Array, w: Array, h: float, *, fresh: bool = True) -> tuple[Array, Array, Array]:
         """Return q, w and u after h; the first stage is there already unless the start is fresh."""
@@ -249,7 +242,7 @@ class RungeKuttaAttempts:
         def rates(t: float, q: Array, u: Array | None, w: Array) -> tuple[Array, Array]:
             if u is None:
                 return w, self._field(t, q, w, self._force)
-            return self._space.rate(u, w), self._field.consistent(t, q, w, self._force)
+            return self._space.rate(u, w), self._field(t, q, w, self._force)
 
         self._stages.keep(0 if fresh else 1)
         return self._tableau.step(self._space, rates, self._stages, t, h, q, w)
@@ -282,6 +275,8 @@ class RungeKuttaAttempts:
             return np.full(q.shape, np.nan), np.full(w.shape, np.nan)
 
     def _inner(self, t: float, q: Array, w: Array, end: float) -> tuple[Array, Array]:
+        if self._within_last is not None and self._within_last.t == t:
+            return self._within_last.at(end)
         self._fresh = True
         return self._step(t, q, w, end - t)[:2]
 
@@ -292,7 +287,7 @@ def _accepted(*ends: tuple[float, Array, Array]) -> AcceptedSteps:
 
 
 class AcrossPoses(RungeKuttaAttempts):
-    """Steps of rk853 in place of another method's near a singular pose, from and to y = (q, v).
+    """Steps of rk853, and of its own near a singular pose, in place of another method's; from and to y = (q, v).
 
     A series, an implicit stage and a method's past all need accelerations at places where these have few digits.
     """
@@ -345,13 +340,6 @@ class AcrossPoses(RungeKuttaAttempts):
         q, w = self.within(0, self._last_step.rows(np.array([0])), np.array([t]))
         return self._vector(q[0], w[0])
 
-    def _inner(self, t: float, q: Array, w: Array, end: float) -> tuple[Array, Array]:
-        # A step that was long enough for its stages is shortened: one of them may come close to the pose.
-        try:
-            return self._near_pose.to_tolerance(t, end - t, q, w, self._force)
-        except DivergenceError:
-            return super()._inner(t, q, w, end)
-
     def _vector(self, q: Array, w: Array) -> Array:
         return np.concatenate([q, self._space.to_body_velocity(q, w)])
 
@@ -384,7 +372,7 @@ class RosenbrockAttempts(RungeKuttaAttempts):
         # y, ẏ and ∂ẏ/∂y at the start; y and ẏ at the end of the last attempt; its t and y at both ends, and stages.
         self._start: tuple[Array, Array, Array] | None = None
         # Its stages are not on the constraints, and its derivatives are those of accelerations that grow at a pose.
-        self._field.near, self._k = False, 0
+        self._field.looks, self._k = False, 0
         self._across = AcrossPoses.of(problem)
         self._crossing = self._crossed = False
         self._arrived: tuple[Array, Array] | None = None
@@ -435,11 +423,11 @@ class RosenbrockAttempts(RungeKuttaAttempts):
     def stuck(self, place: int) -> StoppedError | None:
         return super().stuck(place) if self._across is None or not self._crossing else self._across.stuck(place)
 
-    def _attempt(self, step: float) -> tuple[Array, Array, float]:
-        own, (rtol, atol) = self._own, self._tolerances
+    def _attempt(self, end: float) -> tuple[float, Array, Array, float]:
+        own, (rtol, atol), step = self._own, self._tolerances, end - self._t
         y, there, J = self._known()
         k = self._increments(self._t, y, step, there, J)
-        y1, error, t1 = y + own.b @ k, own.error @ k, self._t + step
+        y1, error, t1 = y + own.b @ k, own.error @ k, end
         self._last_attempt = self._t, t1, y, y1, k
         scale = atol + rtol * np.maximum(np.maximum(np.abs(y), np.abs(y1)), self._turning)
         size = _norm(error / scale)
@@ -450,7 +438,7 @@ class RosenbrockAttempts(RungeKuttaAttempts):
             self._arrived = y1, rate
             if not math.isfinite(size):
                 raise DivergenceError(self._own_rates.why)
-        return *self._state(y1), size
+        return end, *self._state(y1), size
 
     def _known(self) -> tuple[Array, Array, Array]:
         """Return y, ẏ and ∂ẏ/∂y where the step starts, evaluated once for all attempts from there."""

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.engines.constrained import AT_SINGULAR_POSE
 from mbkit.errors import FunctionError
 from mbkit.methods.registry import Tolerances
 from mbkit.model.integration_space import Space
@@ -123,7 +124,9 @@ class GridRecord(RunRecord):
             first = int(lost[np.argmin(good[lost])])
             k, reason = int(good[first]), why(first)
             message = f"diverged after t = {grid.time(k):.6g} s (step {k + 1})" + (f": {reason}" if reason else "")
-            self.early = dict.fromkeys(lost.tolist(), ("diverged", f"{message}; dt = {grid.dt:g} s may be too long"))
+            if AT_SINGULAR_POSE not in reason:
+                message += f"; dt = {grid.dt:g} s may be too long"
+            self.early = dict.fromkeys(lost.tolist(), ("diverged", message))
         rows = int(np.count_nonzero(kept <= good.max())) if len(good) else len(kept)
         q, v = (x if rows == len(kept) else x[:, :rows].copy() for x in (q, v))
         # Read-only, so that nobody needs a copy.
@@ -225,6 +228,8 @@ class TrajectoryRecord(RunRecord):
             self._q = accepted.q[steps]
         if self.passed is not None:
             self.passed.saw_all(accepted.t[1 : steps + 1], accepted.q[1 : steps + 1])
+        if self.passed is not None and hit is not None:
+            self.passed.saw(hit.t, hit.q)
         if hit is not None:
             self.stop_at(hit)
         elif lost:

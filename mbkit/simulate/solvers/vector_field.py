@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +14,11 @@ from mbkit.engines.base import at_time
 from mbkit.errors import InputError, NumericalError
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import unit_quaternions
-from mbkit.simulate.constraint_projection import beside, settled
-from mbkit.simulate.singular_poses import Approach, at_singular_poses
+from mbkit.simulate.constraint_projection import settled
+from mbkit.simulate.singular_poses import Approach
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
 
-Projection = Callable[[Dynamics, float, Array, Array], tuple[Array, Array]]
 DIVERGED: Final = "the state grew beyond all bounds"
 #: A state with a number of this size has diverged: no machine goes there, and energies below can still be computed.
 BOUND: Final = 1e100
@@ -48,24 +46,20 @@ def are_bounded(q: Array, w: Array) -> NDArray[np.bool_]:
 class Field:
     """ẇ of the integrators' state, from an engine's forward dynamics; `evaluations` are summed over a batch.
 
-    Without a space, w is mbkit's v. Under constraints the stages of a step near a singular pose are projected:
-    a fixed step says by `near` whether it is, and an adaptive run looks ahead.
+    Without a space, w is mbkit's v. Under constraints an adaptive run looks how near a singular pose it is.
     """
 
-    #: Whether this step is near a singular pose; None where the run looks ahead.
-    near: bool | None = None
+    #: Whether the ends of steps are looked at.
+    looks: bool = True
 
     def __init__(self, dyn: Dynamics, space: Space | None) -> None:
         self._dyn, self._space = dyn, None if space is None or space.flat else space
         self._use(dyn)
         self.evaluations = 0
-        #: Why a motion at a singular pose went no further.
-        self.undetermined = ""
 
     def only(self, members: Indices) -> None:
         """Go on with these members of the whole batch."""
         self._use(self._dyn._of_samples(members))
-        self.undetermined = ""
 
     def _use(self, own: Dynamics) -> None:
         self._own, self._forward, self._timed = own, own.forward_dynamics, own.model.time_parameter is not None
@@ -77,37 +71,26 @@ class Field:
     @property
     def near_singular(self) -> bool:
         """Whether constraints may soon depend on each other."""
-        near = self._approach.near if self.near is None else self.near
-        return self._constrained and near
+        return self._constrained and self._approach.near
 
     def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
         """Return the state that a step led to, on its constraints if there are some."""
         if not self._constrained:
             return q, w
-        q, w = self._projected(settled, t, q, w)
+        if self._space is None:
+            q, w = settled(self._own, t, q, w)
+        else:
+            q, v = settled(self._own, t, q, self._space.to_body_velocity(q, w))
+            w = self._space.to_integrator_velocity(q, v)
         self.look(t, q, w)
         return q, w
 
     def look(self, t: float, q: Array, w: Array) -> None:
         """Look how near a singular pose the run is, at the start or the end of a step."""
-        if self._constrained and self.near is None:
+        if self._constrained and self.looks:
             self._approach.saw(self._own, t, q, w if self._space is None else self._space.to_body_velocity(q, w))
 
     approach: Approach = forwarded("_approach", "How near a singular pose the run is.")
-
-    def _projected(self, onto: Projection, t: float, q: Array, w: Array) -> tuple[Array, Array]:
-        """Return the state that a projection makes of one in the integrators' velocity."""
-        if self._space is None:
-            return onto(self._own, t, q, w)
-        q, v = onto(self._own, t, q, self._space.to_body_velocity(q, w))
-        return q, self._space.to_integrator_velocity(q, v)
-
-    def consistent(self, t: float, q: Array, w: Array, force: Force) -> Array:
-        """Return ẇ at a stage; near a singular pose at the state on the constraints beside it."""
-        if self.near_singular:
-            # One of a batch with parameters of its own is a batch of one.
-            q, w = (x.reshape(y.shape) for x, y in zip(self._projected(beside, t, q, w), (q, w), strict=True))
-        return self(t, q, w, force)
 
     def __call__(self, t: float, q: Array, w: Array, force: Force) -> Array:
         """Return ẇ, or raise `DivergenceError`."""
@@ -115,35 +98,10 @@ class Field:
         if not isinstance(force, np.ndarray):
             # Never call the user's function on a state that is not finite.
             if not are_bounded(q, v).all():
-                raise DivergenceError(self.undetermined or DIVERGED)
+                raise DivergenceError(DIVERGED)
             force = force(t, q, v)
         self.evaluations += 1 if q.ndim == 1 else len(q)
-        a = self._at_poses(t, q, v, force) if self.near_singular else None
-        if a is None:
-            a = self._evaluated(t, q, v, force)
-        return a if self._space is None else np.asarray(self._space.acceleration(q, v, a))
-
-    def _at_poses(self, t: float, q: Array, v: Array, force: Array) -> Array | None:
-        """Return v̇ where some states are at singular poses; None where none is."""
-        which, a, why = at_singular_poses(self._own, t, q, v, force)
-        if not which.any():
-            return None
-        self.undetermined = why or self.undetermined
-        if which.all():
-            if why:
-                raise DivergenceError(why)
-            return a
-        a[~which] = self._evaluated(t, q, v, force, ~which)
-        return a
-
-    def _evaluated(self, t: float, q: Array, v: Array, force: Array, which: Any = None) -> Array:
-        own, forward = self._own, self._forward
-        if self._timed:
-            forward = at_time(own, t).forward_dynamics
-        if which is not None:
-            own = own._of_samples(np.flatnonzero(which))
-            forward = (at_time(own, t) if self._timed else own).forward_dynamics
-            q, v, force = q[which], v[which], force if force.ndim == 1 else force[which]
+        forward = at_time(self._own, t).forward_dynamics if self._timed else self._forward
         try:
             a = forward(q, v, force)
         except NumericalError as error:
@@ -152,8 +110,9 @@ class Field:
         except InputError:
             if np.isfinite(q).all() and np.isfinite(v).all():
                 raise
-            raise DivergenceError(self.undetermined or DIVERGED) from None
-        return np.asarray(a if a.ndim == v.ndim else a[0])
+            raise DivergenceError(DIVERGED) from None
+        a = np.asarray(a if a.ndim == v.ndim else a[0])
+        return a if self._space is None else np.asarray(self._space.acceleration(q, v, a))
 
 
 class Rates:
@@ -165,7 +124,7 @@ class Rates:
     def __init__(self, dyn: Dynamics) -> None:
         self._model, self._field = dyn.model, Field(dyn, None)
         # Steps near a singular pose are not made of these.
-        self._field.near = False
+        self._field.looks = False
         layout = dyn.model.layout
         self._joints = [(j.type, layout.q[j.name], layout.v[j.name]) for j in dyn.model.independent_joints]
         self.why = ""
