@@ -141,11 +141,12 @@ class Phases:
 
     def _locked(self, dyn: Dynamics, t: float | Array, q: Array, still: Mask) -> Mask:
         """Return which of those at rest have rotors that nothing moves, of the shape of v."""
-        if not (self._bound and still.any()):
-            return still.copy()
-        free = self._directions(dyn, t, q)
-        each = [independent(*one) for one in zip(_rows(free, 2), _rows(still), strict=True)]
-        return np.array(each).reshape(still.shape)
+        out = still.copy()
+        if self._bound and still.any():
+            free, rests = _rows(self._directions(dyn, t, q), 2), _rows(out)
+            for i in np.flatnonzero(rests.any(axis=1)):
+                rests[i] = independent(free[i], rests[i])
+        return out
 
     def margins(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> Array:
         """Return how far each velocity with friction is from the end of its phase, negative beyond; (k,) or (N, k).
