@@ -54,32 +54,16 @@ def run_fixed_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics]
 
     Torque functions, and engines whose parameters are not numbers, take the members of a batch one by one.
     """
-    every = np.arange(len(problem.q))
-    if side_by_side(problem):
+    every, record = np.arange(len(problem.q)), GridRecord(problem)
+    together = side_by_side(problem)
+    if together:
         try:
-            return _together(problem, [_Members(problem, every, solver, side_by_side=True)])
+            _Members(problem, every, solver, record).to_end()
         except NumericalError:
             # One state failed: the others have nothing to do with it.
-            pass
-    return _together(problem, [_Members(problem, every[i : i + 1], solver, side_by_side=False) for i in every])
-
-
-def _together(problem: IntegrationProblem, parts: list[_Members]) -> SolverResult:
-    record = GridRecord(problem)
-    for part in parts:
-        try:
-            part.to_end(record)
-        except FunctionError as failed:
-            record.error = failed
-        except NumericalError as failed:
-            if part.side_by_side:
-                raise
-            reached = problem.grid.time(int(part.k[0]))
-            part.early[int(part.members[0])] = "diverged", f"diverged after t = {reached:.6g} s: {failed}"
-        record.good[part.members] = part.k
-        record.early |= part.early
-        record.error = record.error or part.error
-        record.events += part.hits
+            together, record = False, GridRecord(problem)
+    for i in () if together else every.tolist():
+        _Members(problem, every[i : i + 1], solver, record, alone=True).to_end()
         if record.error is not None:
             break
     record.events.sort(key=lambda x: (x.member or 0, x.t))
@@ -90,31 +74,43 @@ class _Members:
     """Trajectories of a problem, side by side or one alone."""
 
     def __init__(
-        self, problem: IntegrationProblem, members: Indices, solver: Callable[[Dynamics], Solver], *, side_by_side: bool
+        self,
+        problem: IntegrationProblem,
+        members: Indices,
+        solver: Callable[[Dynamics], Solver],
+        record: GridRecord,
+        *,
+        alone: bool = False,
     ) -> None:
-        self.problem, self.members, self.side_by_side, self._solver = problem, members, side_by_side, solver
-        alone = None if side_by_side else problem.member(int(members[0]))
-        self._alone = alone
-        dyn = problem.dyn if alone is None else problem.dyn._of_sample(alone)
-        self.phases = Phases(dyn, side_by_side=side_by_side)
+        self.problem, self.members, self.side_by_side, self._solver = problem, members, not alone, solver
+        self._alone = problem.member(int(members[0])) if alone else None
+        dyn = problem.dyn if self._alone is None else problem.dyn._of_sample(self._alone)
+        self.phases = Phases(dyn, side_by_side=not alone)
         self._timed = dyn.model.time_parameter is not None
-        self._force = None if side_by_side else problem.torque.of_member(alone)
-        self.q, self.v = problem.q[members].copy(), problem.v[members].copy()
+        self._force = problem.torque.of_member(self._alone) if alone else None
+        self.q, self.v, self._record = problem.q[members].copy(), problem.v[members].copy(), record
         n = len(members)
         #: Steps done by each.
         self.k: Indices = np.zeros(n, dtype=np.intp)
         self._empty = np.zeros(n, dtype=int)
         self._going = np.full(n, True)
-        #: How those ended that did so early, and why.
-        self.early: dict[int, tuple[Ended, str]] = {}
-        self.error: FunctionError | None = None
-        self.hits: list[Hit] = []
         self._phase: Phase
 
-    def to_end(self, record: GridRecord) -> None:
+    def to_end(self) -> None:
         """Go over the grid."""
-        grid = self.problem.grid
-        self._record = record
+        try:
+            self._to_end()
+        except FunctionError as failed:
+            self._record.error = failed
+        except NumericalError as failed:
+            if self.side_by_side:
+                raise
+            reached = self.problem.grid.time(int(self.k[0]))
+            self._end_early(0, "diverged", f"diverged after t = {reached:.6g} s: {failed}")
+        self._record.good[self.members] = self.k
+
+    def _to_end(self) -> None:
+        grid, record = self.problem.grid, self._record
         if not grid.steps or not len(self.k):
             return
         rows, start = np.arange(len(self.k)), self.times(np.full(len(self.k), grid.start))
@@ -124,10 +120,14 @@ class _Members:
         self._phase = self.begin(rows, start)
         self._shortest = max(_BLOCK, _SET_UP // len(rows) if self._compiled(self._phase.dyn) else 0)
         self._window, parts = self._shortest, len(self.problem.q) // len(self.k)
-        while self.error is None and self._going.any():
+        while record.error is None and self._going.any():
             self._block()
             self._going &= self.k < grid.steps
             self.problem.bar.update((self.members[0] / len(self.k) + self.k.mean() / grid.steps) / parts)
+
+    def _end_early(self, row: int, ended: Ended, why: str) -> None:
+        self._going[row] = False
+        self._record.early[int(self.members[row])] = ended, why
 
     # Forces
 
@@ -206,7 +206,7 @@ class _Members:
     def _block(self) -> None:
         rows, left, n, h = self._next()
         self._sample(rows)
-        grid, k = self.problem.grid, self.k[rows]
+        grid, record, k = self.problem.grid, self._record, self.k[rows]
         phase = self._phase if len(rows) == len(self.k) else self._phase.take(rows)
         start = grid.time(int(k.min()))
         compiled = phase.still.any() and self._compiled(phase.dyn)
@@ -236,8 +236,8 @@ class _Members:
             self._keep(rows, k, good, q, v)
         self.q[rows], self.v[rows] = q[last], v[last]
         self.k[rows] = k + good
-        self.error = result.error
-        if self.error is None:
+        record.error = result.error
+        if record.error is None:
             self._lose(rows[(good == limit) & (limit < np.minimum(left, n))], result)
             self._across(rows[good < limit])
 
@@ -336,15 +336,13 @@ class _Members:
         return _first(margins < 0, limit)
 
     def _lose(self, rows: Indices, result: SolverResult) -> None:
-        self._going[rows] = False
         for i in rows.tolist():
-            member = int(self.members[i])
-            message = result.message
+            message, own = result.message, self.members[i : i + 1]
             if self.side_by_side:
-                alone = _Members(self.problem, self.members[i : i + 1], self._solver, side_by_side=False)
-                alone.to_end(GridRecord(self.problem))
-                message = alone.early.get(member, ("", message))[1]
-            self.early[member] = "diverged", message
+                apart = GridRecord(self.problem)
+                _Members(self.problem, own, self._solver, apart, alone=True).to_end()
+                message = apart.early.get(int(own[0]), ("", message))[1]
+            self._end_early(i, "diverged", message)
 
     # The end of a phase
 
@@ -401,10 +399,8 @@ class _Members:
         v, leaving = self.phases.after(before, self.times(t), *state, self.forces(rows))
         self._empty[rows] = np.where(moved, 0, self._empty[rows] + 1)
         decided = self._empty[rows] <= MAX_EMPTY_PHASES
-        self._going[rows] = decided
         for i, time in zip(rows[~decided].tolist(), t[~decided].tolist(), strict=True):
-            why = f"{UNDECIDED} at t = {time:.9g} s: their phases end where they begin"
-            self.early[int(self.members[i])] = "step_too_small", why
+            self._end_early(i, "step_too_small", f"{UNDECIDED} at t = {time:.9g} s: their phases end where they begin")
         self.q[rows], self.v[rows] = state[0], v
         # A joint that let go and came to rest at once did not let go.
         after = self.begin(rows, self.times(later), leaving * (moved | pushed)[:, None])
@@ -412,7 +408,7 @@ class _Members:
             if decided[i]:
                 row = rows[i]
                 at = float(t[i]), self.q[row].copy(), self.v[row].copy()
-                self.hits.append(Hit(name, *at, self.problem.member(int(self.members[row]))))
+                self._record.events.append(Hit(name, *at, self.problem.member(int(self.members[row]))))
         return after, decided
 
 
