@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
@@ -19,10 +20,12 @@ from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
 from mbkit.simulate.singular_poses import SingularPosesOfBatch
-from mbkit.simulate.solvers.in_phases.phases import Phases, applied, force_of, side_by_side
+from mbkit.simulate.solvers.fixed_step import SteppedRun, Stepper
+from mbkit.simulate.solvers.in_phases.phases import Phases, applied, side_by_side
 from mbkit.simulate.solvers.trajectory_record import GridRecord
-from mbkit.simulate.solvers.vector_field import DIVERGED
+from mbkit.simulate.solvers.vector_field import DIVERGED, DivergenceError
 from mbkit.simulate.time_grid import Indices
+from mbkit.simulate.torque import Force
 
 #: Attempts at once, and the most for one step for each velocity with friction.
 _ROUNDS: Final = 512
@@ -33,87 +36,77 @@ _UNDECIDED: Final = "which joints rest cannot be decided"
 
 def run_moreau(problem: IntegrationProblem) -> SolverResult:
     """Step one state or a batch over the grid."""
-    dyn, torque, every = problem.dyn, problem.torque, np.arange(len(problem.q))
+    dyn, every = problem.dyn, np.arange(len(problem.q))
     record, reasons = GridRecord(problem), dict[int, str]()
-    compiled = dyn._derived and not torque.callable and "jump" in dyn.model.effects
-    compiled = compiled and getattr(dyn, "_compiles_steps", False) and not dyn.model.constrained
-    if not compiled and side_by_side(problem):
-        run = _InPython(problem, dyn, every, record, side_by_side=True)
-        steps, attempts, why = run.run()
-        if not why:
-            record.good[:], record.evaluations = steps, attempts
-            problem.bar.update(1.0)
-            return record.result()
-        # One state failed: the others have nothing to do with it.
-    for i in every.tolist():
-        member = problem.member(i)
-        own = dyn if member is None else dyn._of_sample(i)
-        one = (_Compiled if compiled else _InPython)(problem, own, every[[i]], record)
-        steps, attempts, reasons[i] = one.run()
-        record.good[i], record.error = steps, one.error
-        record.evaluations += attempts
-        if one.error is not None:
+    if _compiles(problem):
+        for i in every.tolist():
+            member = problem.member(i)
+            one = _Compiled(problem, dyn if member is None else dyn._of_sample(i), every[[i]], record)
+            steps, attempts, reasons[i] = one.run()
+            record.good[i], record.error = steps, one.error
+            record.evaluations += attempts
+            if one.error is not None:
+                break
+            if problem.grid.steps:
+                problem.report(i)(problem.end)
+        return record.result(lambda i: reasons[i])
+    together = problem.batch is None or side_by_side(problem)
+    for members in [every] if together else [every[[i]] for i in every]:
+        stepper = _Stepper(problem, members)
+        run = SteppedRun(problem, stepper, problem.v0.copy(), record, None if together else members)
+        run.to_end()
+        reasons |= dict.fromkeys(members.tolist(), run.why)
+        record.poses = {**record.poses, **stepper.poses}
+        if record.error is not None:
             break
-        if problem.grid.steps:
-            problem.report(i)(problem.end)
+    record.evaluations = int(record.good.sum())
     return record.result(lambda i: reasons[i])
 
 
-class _InPython:
-    """The steps of one trajectory, or of several side by side, each as a problem of impulses with bounds."""
+def _compiles(problem: IntegrationProblem) -> bool:
+    dyn = problem.dyn
+    plain = dyn._derived and not problem.torque.callable and "jump" in dyn.model.effects and not dyn.model.constrained
+    return plain and bool(getattr(dyn, "_compiles_steps", False))
 
-    #: Error of a torque function that failed.
-    error: FunctionError | None = None
 
-    def __init__(
-        self,
-        problem: IntegrationProblem,
-        dyn: Dynamics,
-        members: Indices,
-        record: GridRecord,
-        *,
-        side_by_side: bool = False,
-    ) -> None:
-        self._problem, self._dyn, self._record, self._members = problem, dyn, record, members
-        self._force = None if side_by_side else problem.torque.of_member(problem.member(int(members[0])))
-        self._phases, self._space = Phases(dyn, side_by_side=side_by_side), Space(dyn.model)
+class _Stepper(Stepper):
+    """Steps of one trajectory, or of several side by side, each as a problem of impulses with bounds."""
+
+    def __init__(self, problem: IntegrationProblem, members: Indices) -> None:
+        self._problem, self._alone = problem, not side_by_side(problem)
+        self._space = Space(problem.dyn.model)
+        watched = members.tolist() if problem.dyn._projects else ()
+        self._poses = SingularPosesOfBatch(problem.dyn, problem.start, problem.q, watched)
+        self.poses = self._poses.members
+        self.only(members)
+
+    def only(self, members: Indices, good: NDArray[np.bool_] | None = None) -> None:  # noqa: ARG002
+        dyn, self._members = self._problem.dyn, members
+        if self._problem.batch is not None:
+            dyn = dyn._of_sample(int(members[0])) if self._alone else dyn._of_samples(members)
+        self._dyn, self._phases = dyn, Phases(dyn, side_by_side=not self._alone)
         none = np.zeros((len(members), dyn.model.nv))
         self._law = dyn._jumps.law_of(dyn)
         self._rubs = np.broadcast_to(self._law.bound > 0, none.shape)
         # Without friction: neither a side nor rest.
         self._smooth = self._phases.given(none, none > 0, none > 0, dyn).dyn if self._rubs.any() else dyn
-        self._poses: SingularPosesOfBatch | None = None
-        if dyn._projects:
-            self._poses = SingularPosesOfBatch(problem.dyn, problem.start, problem.q, members.tolist())
-            record.poses = {**record.poses, **self._poses.members}
 
-    def run(self) -> tuple[int, int, str]:
-        """Return the good steps, the evaluations, and why there are not more."""
-        problem, record, members = self._problem, self._record, self._members
-        grid, torque = problem.grid, problem.torque
-        q, v = problem.q[members], problem.v[members]
-        for k in range(grid.steps):
-            evaluations = k * len(members)
-            try:
-                torque.sample(k, grid.time(k), q, v, members)
-                force = force_of(torque, self._force, np.full(len(members), k), members)
-                q, v = self._step(grid.time(k), grid.step(k), q, v, force)
-            except (NumericalError, np.linalg.LinAlgError) as error:
-                return k, evaluations, str(error)
-            except FunctionError as error:
-                self.error = error
-                return k, evaluations, str(error)
-            if not (np.abs(q).max(initial=0) < _RUNAWAY and np.abs(v).max(initial=0) < _RUNAWAY):
-                return k, evaluations, DIVERGED
-            if self._poses is not None:
-                self._poses.saw(self._dyn, grid.time(k + 1), q, members)
-            rows = record.rows(k + 1, k + 1)
-            record.q[members, rows], record.v[members, rows] = q[:, None], v[:, None]
-        return grid.steps, grid.steps * len(members), ""
+    def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
+        if self.poses:
+            self._poses.saw(self._dyn, t, np.atleast_2d(q), self._members)
+        return q, w
 
-    def _step(self, t: float, h: float, q: Array, v: Array, force: Any) -> tuple[Array, Array]:
+    def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
+        tau = np.atleast_2d(applied(force, t, q, w))
+        try:
+            q1, v1 = self._step(t, h, np.atleast_2d(q), np.atleast_2d(w), tau)
+        except (NumericalError, np.linalg.LinAlgError) as error:
+            raise DivergenceError(str(error)) from None
+        return q1.reshape(q.shape), v1.reshape(w.shape)
+
+    def _step(self, t: float, h: float, q: Array, v: Array, tau: Array) -> tuple[Array, Array]:
         dyn, space, bound = at_time(self._smooth, t), self._space, self._dyn.model.constrained
-        smooth = v + h * dyn.forward_dynamics(q, v, applied(force, t, q, v))
+        smooth = v + h * dyn.forward_dynamics(q, v, tau)
         inverse = self._dyn._jumps.responses(dyn, q)
         if bound:
             # Rows hold velocities, not their rates: else no velocities of what rests together may be zero.
