@@ -13,13 +13,14 @@ from weakref import WeakValueDictionary
 
 import casadi as ca
 import numpy as np
+from llvmlite import ir
 
 from mbkit._check import Array
 from mbkit._child_process import cores
 from mbkit._version import __version__
 from mbkit.codegen import disk_cache as disk
 from mbkit.codegen import jit
-from mbkit.codegen.batch_loop import RUN
+from mbkit.codegen.batch_loop import RUN, Builder
 from mbkit.codegen.program import program
 from mbkit.codegen.python_call import Kernel, python_call
 from mbkit.derivation.fingerprint import SOURCES
@@ -196,58 +197,43 @@ _HELD: Final[WeakValueDictionary[str, Compiled]] = WeakValueDictionary()
 # The list holds the number of its calls, and for each the addresses of loop, table and work space, how many states and
 # moves it has, and the address of these: where in the table an array's address stands, that address in round 0, and the
 # bytes to the next round. The signature is that of a compiled function's own loop, so that it is loaded like one.
-_ENTRY: Final = "{ptr, ptr, ptr, i64, i64, ptr}"
-_CODE: Final = f"""
-define void @{RUN}(ptr %list, ptr %unused, i64 %first, i64 %last) nounwind {{
-entry:
-  %calls = load i64, ptr %list
-  %entries = getelementptr i64, ptr %list, i64 1
-  %round0 = sdiv i64 %first, %calls
-  %at0 = srem i64 %first, %calls
-  %any = icmp slt i64 %first, %last
-  br i1 %any, label %one, label %done
-one:
-  %i = phi i64 [ %first, %entry ], [ %next, %made ]
-  %at = phi i64 [ %at0, %entry ], [ %following, %made ]
-  %round = phi i64 [ %round0, %entry ], [ %after, %made ]
-  %call = getelementptr {_ENTRY}, ptr %entries, i64 %at
-  %fields = load {_ENTRY}, ptr %call
-  %run = extractvalue {_ENTRY} %fields, 0
-  %table = extractvalue {_ENTRY} %fields, 1
-  %work = extractvalue {_ENTRY} %fields, 2
-  %states = extractvalue {_ENTRY} %fields, 3
-  %moves = extractvalue {_ENTRY} %fields, 4
-  %moved = extractvalue {_ENTRY} %fields, 5
-  br label %check
-check:
-  %j = phi i64 [ 0, %one ], [ %more, %move ]
-  %left = icmp slt i64 %j, %moves
-  br i1 %left, label %move, label %made
-move:
-  %where = getelementptr {{ptr, i64, i64}}, ptr %moved, i64 %j
-  %what = load {{ptr, i64, i64}}, ptr %where
-  %place = extractvalue {{ptr, i64, i64}} %what, 0
-  %start = extractvalue {{ptr, i64, i64}} %what, 1
-  %bytes = extractvalue {{ptr, i64, i64}} %what, 2
-  %way = mul i64 %round, %bytes
-  %address = add i64 %start, %way
-  store i64 %address, ptr %place
-  %more = add i64 %j, 1
-  br label %check
-made:
-  call void %run(ptr %table, ptr %work, i64 0, i64 %states)
-  %next = add i64 %i, 1
-  %beside = add i64 %at, 1
-  %ends = icmp eq i64 %beside, %calls
-  %following = select i1 %ends, i64 0, i64 %beside
-  %turned = add i64 %round, 1
-  %after = select i1 %ends, i64 %turned, i64 %round
-  %going = icmp slt i64 %next, %last
-  br i1 %going, label %one, label %done
-done:
-  ret void
-}}
-"""
+_ENTRY_WORDS: Final = 6
+_I64, _POINTER = ir.IntType(64), ir.PointerType()
+
+
+def _code() -> str:
+    module = ir.Module("sequence")
+    kind = ir.FunctionType(ir.VoidType(), [_POINTER, _POINTER, _I64, _I64])
+    function = ir.Function(module, kind, RUN)
+    b = Builder(function.append_basic_block("entry"))
+    given, _, first, last = function.args
+    calls, entries = b.get(given, _I64(0), _I64), b.at(given, _I64(1), _I64)
+    # The call and the round that come next; divisions would cost as much as small kernels.
+    state = b.room(_I64, 2)
+    b.set(b.srem(first, calls), state, _I64(0), _I64)
+    b.set(b.sdiv(first, calls), state, _I64(1), _I64)
+
+    def one(_: Any) -> None:
+        at, turn = (b.get(state, _I64(k), _I64) for k in range(2))
+        entry = b.at(entries, b.mul(at, _I64(_ENTRY_WORDS)), _I64)
+        run, table, work, states, moves, moved = (b.get(entry, _I64(k), _I64) for k in range(_ENTRY_WORDS))
+
+        def move(j: Any) -> None:
+            words = b.at(b.inttoptr(moved, _POINTER), b.mul(j, _I64(3)), _I64)
+            place, start, by = (b.get(words, _I64(k), _I64) for k in range(3))
+            b.store(b.add(start, b.mul(turn, by)), b.inttoptr(place, _POINTER), align=8)
+
+        b.count(_I64(0), moves, 1, move)
+        arguments = [*(b.inttoptr(x, _POINTER) for x in (table, work)), _I64(0), states]
+        b.call(b.inttoptr(run, ir.PointerType(kind)), arguments)
+        following = b.add(at, _I64(1))
+        ends = b.icmp_signed("==", following, calls)
+        b.set(b.select(ends, _I64(0), following), state, _I64(0), _I64)
+        b.set(b.select(ends, b.add(turn, _I64(1)), turn), state, _I64(1), _I64)
+
+    b.count(first, last, 1, one)
+    b.ret_void()
+    return str(module)
 
 
 class Call(NamedTuple):
@@ -290,4 +276,4 @@ class KernelSequence:
 
 @cache
 def _runner() -> jit.Loaded:
-    return jit.load(jit.shared_object("sequence", lambda: jit.object_code(_CODE)))
+    return jit.load(jit.shared_object("sequence", lambda: jit.object_code(_code(), optimize=True)))
