@@ -54,11 +54,16 @@ def needed(package: str, by: str) -> Iterator[None]:
         raise UnsupportedError(f"{by} needs {package}, which is not installed; pip install {package}") from error
 
 
-def arrays_shown(value: Any) -> str:
-    """Return a short repr of a result that holds arrays: their names and shapes, and numbers as they are."""
-    fields = value._asdict() if hasattr(value, "_asdict") else vars(value)
-    shapes = (f"{k} {x.shape}" if isinstance(x, np.ndarray) else f"{k} {x!r}" for k, x in fields.items())
-    return f"<{type(value).__name__}: {', '.join(shapes)}>"
+def with_shapes(kind: type[K]) -> type[K]:
+    """Give results that hold arrays a short repr: their names and shapes, and numbers as they are."""
+
+    def shapes(self: Any) -> str:
+        fields = self._asdict() if hasattr(self, "_asdict") else vars(self)
+        texts = (f"{k} {x.shape}" if isinstance(x, np.ndarray) else f"{k} {x!r}" for k, x in fields.items())
+        return f"<{type(self).__name__}: {', '.join(texts)}>"
+
+    kind.__repr__ = shapes  # type: ignore[method-assign]  # of every one
+    return kind
 
 
 def all_finite(array: Array) -> bool:

@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, arrays_shown, real
+from mbkit._check import Array, real, with_shapes
 from mbkit.engines.evaluation import Evaluation
 from mbkit.engines.steps import Slopes, differentiable_method, step_derivatives
 from mbkit.errors import InputError, NumericalError, UnsupportedError, require_known
@@ -39,6 +39,7 @@ DIFFERENTIABLE: Final = of_groups("equation")
 _MAX_DERIVATIVES_AT_A_TIME: Final = 2**18
 
 
+@with_shapes
 class DiscreteLinearization(NamedTuple):
     """Small changes of a state over a step: x₁ = A x + B δτ, with τ held. See `Linearization` for x.
 
@@ -52,10 +53,8 @@ class DiscreteLinearization(NamedTuple):
     #: The step of the state itself, (2nv,) or (N, 2nv): it leads to ``model.integrate(q, f[:nv])`` and ``v + f[nv:]``.
     f: Array
 
-    def __repr__(self) -> str:
-        return arrays_shown(self)
 
-
+@with_shapes
 class Linearization(NamedTuple):
     """Small changes of a state (q, v) under a force τ: ẋ = A x + B δτ.
 
@@ -72,9 +71,6 @@ class Linearization(NamedTuple):
     #: A for the same changes measured at this very state, which stays: y = (difference(q, q(t)), v(t) - v) follows
     #: ẏ = f + A_fixed y + B δτ. It differs from A at moving free and ball joints, which have half of -ad_v and -ω̂ here.
     A_fixed: Array
-
-    def __repr__(self) -> str:
-        return arrays_shown(self)
 
     @property
     def eigenvalues(self) -> Any:
@@ -114,6 +110,7 @@ class Linearization(NamedTuple):
         return out
 
 
+@with_shapes
 class InverseDynamicsDerivatives(NamedTuple):
     """Derivatives of τ = M a + nle - τ_passive, each (nv, nv) or (N, nv, nv)."""
 
@@ -124,10 +121,8 @@ class InverseDynamicsDerivatives(NamedTuple):
     #: ∂τ/∂a, the mass matrix.
     a: Array
 
-    def __repr__(self) -> str:
-        return arrays_shown(self)
 
-
+@with_shapes
 class ForwardDynamicsDerivatives(NamedTuple):
     """Derivatives of v̇ = M⁻¹ (τ + τ_passive - nle), each (nv, nv) or (N, nv, nv)."""
 
@@ -138,10 +133,8 @@ class ForwardDynamicsDerivatives(NamedTuple):
     #: ∂v̇/∂τ, the inverse of the mass matrix.
     tau: Array
 
-    def __repr__(self) -> str:
-        return arrays_shown(self)
 
-
+@with_shapes
 class InverseDynamicsSecondDerivatives(NamedTuple):
     """Second derivatives of τ = M a + nle - τ_passive, each (nv, nv, nv) or (N, nv, nv, nv).
 
@@ -158,9 +151,6 @@ class InverseDynamicsSecondDerivatives(NamedTuple):
     vv: Array
     #: ∂²τ_i/∂q_j ∂a_k, the derivatives of the mass matrix's column k.
     qa: Array
-
-    def __repr__(self) -> str:
-        return arrays_shown(self)
 
 
 def of_second_order(out: Any) -> Any:

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, arrays_shown, real
+from mbkit._check import Array, real, with_shapes
 from mbkit._warn import warn
 from mbkit.engines.base import Dynamics, no_dynamics
 from mbkit.engines.frames_and_momenta import ALIGNED
@@ -32,6 +32,7 @@ OPERATIONAL_SPACE: Final = Path(
 )
 
 
+@with_shapes
 @dataclass(frozen=True)
 class OperationalSpace:
     """The dynamics of a task at one pose, or at N of them, with m rows.
@@ -59,9 +60,6 @@ class OperationalSpace:
     null_space: Array
     reciprocal_condition: Any
     damped: Any
-
-    def __repr__(self) -> str:
-        return arrays_shown(self)
 
 
 def operational_space(

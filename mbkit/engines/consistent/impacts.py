@@ -17,12 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, arrays_shown, batch_of, real, real_array, require_finite
+from mbkit._check import Array, batch_of, real, real_array, require_finite, with_shapes
 from mbkit._reproducible import independent_rows, under_rows
 from mbkit.engines.base import Dynamics, no_dynamics
 from mbkit.errors import InputError, NumericalError
 
 
+@with_shapes
 @dataclass(frozen=True)
 class Impact:
     """Velocities after an impact and the impulses that made them, at one state or at N.
@@ -45,9 +46,6 @@ class Impact:
     impulses: Array
     reactions: Array
     energy_change: Any
-
-    def __repr__(self) -> str:
-        return arrays_shown(self)
 
 
 def impact(
