@@ -35,6 +35,7 @@ from mbkit.model import manifold
 from mbkit.model.description import Description
 from mbkit.model.elements.paths import Path
 from mbkit.model.parts import Body, Joint, Numbers, _Frozen, rules_of
+from mbkit.model.poses import frame_of, pose_of
 from mbkit.spatial import skew
 
 #: The ten standard parameters of a body, in the order of Khalil and Dombre, and the places of its inertia.
@@ -256,7 +257,7 @@ def energy_regressor(model: Description, q: Array, v: Array, gravity: Array) -> 
     kinetic, potential = [np.zeros((n, 0))], [np.zeros((n, 0))]
     for joint in model.tree:
         at, moving = list(q_full[:, layout.full_q[joint.name]].T), list(v_full[:, layout.full_v[joint.name]].T)
-        step = _frame(joint) @ _pose(joint, at, n)
+        step = frame_of(joint) @ pose_of(joint, at, n)
         turned = step[:, :3, :3].transpose(0, 2, 1)
         back = np.zeros((n, 4, 4))
         back[:, :3, :3], back[:, :3, 3:], back[:, 3, 3] = turned, -turned @ step[:, :3, 3:], 1.0
@@ -333,7 +334,7 @@ def _points_at_rest(joint: Joint, length: float, tolerance: float) -> tuple[Arra
     q = np.zeros((PROBES, kind.nq))
     if kind.quaternion is not None:
         q[:, kind.quaternion + 3] = 1.0
-    place = _frame(joint) @ _pose(joint, list(q[:1].T), 1)[0]
+    place = frame_of(joint) @ pose_of(joint, list(q[:1].T), 1)[0]
     at = list(kind.integrate(q, rng.standard_normal((PROBES, kind.nv))).T)
     units = np.diag([length if k in kind.lengths else 1.0 for k in range(kind.nv)])
     motions = np.concatenate([np.zeros((1, 4)), *(_rate(joint, at, list(v), PROBES).reshape(-1, 4) for v in units)])
@@ -406,24 +407,6 @@ def pseudo_inertia(parameters: Array) -> Array:
 def parameters_of(J: Array) -> Array:
     """Return the ten parameters, (..., 10), of pseudo-inertias."""
     return np.asarray(np.einsum("kij,...ij->...k", _F, J))
-
-
-def _frame(joint: Joint) -> Array:
-    """Return the joint's fixed frame in the parent's."""
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = joint.rotation, joint.translation
-    return out
-
-
-def _pose(joint: Joint, q: list[Array], n: int) -> Array:
-    """Return the child's pose in the joint's frame, (n, 4, 4)."""
-    R, p = joint.type.placement(np, joint, q)
-    out = np.zeros((n, 4, 4))
-    for i, row in enumerate(R):
-        for j, x in enumerate((*row, p[i])):
-            out[:, i, j] = x
-    out[:, 3, 3] = 1.0
-    return out
 
 
 def _rate(joint: Joint, q: list[Array], v: list[Any], n: int) -> Array:

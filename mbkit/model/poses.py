@@ -6,22 +6,35 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.model.description import Description
-from mbkit.model.parts import Body
+from mbkit.model.parts import Body, Joint
 
 
 def body_poses(model: Description, q: Array) -> dict[str, tuple[Array, Array]]:
     """Return R_WB (n, 3, 3) and p_WB (n, 3) in m of every body and of ``"world"`` at configurations (n, nq)."""
     n, full = len(q), model.layout.expand_q(q)
-    poses = {"world": (np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)))}
+    X = {"world": np.broadcast_to(np.eye(4), (n, 4, 4))}
     for joint in model.tree:
-        R_WP, p_WP = poses[joint.parent]
-        R, p = joint.type.placement(np, joint, list(full[:, model.layout.full_q[joint.name]].T))
-        R_JC = np.array([[np.broadcast_to(x, n) for x in row] for row in R]).transpose(2, 0, 1)
-        p_JC = np.array([np.broadcast_to(x, n) for x in p]).T
-        R_WJ = R_WP @ joint.rotation
-        p_WC = p_WP + R_WP @ joint.translation + np.einsum("nij,nj->ni", R_WJ, p_JC)
-        poses[joint.child] = R_WJ @ R_JC, p_WC
-    return poses
+        own = list(full[:, model.layout.full_q[joint.name]].T)
+        X[joint.child] = X[joint.parent] @ frame_of(joint) @ pose_of(joint, own, n)
+    return {name: (x[:, :3, :3], x[:, :3, 3]) for name, x in X.items()}
+
+
+def frame_of(joint: Joint) -> Array:
+    """Return the joint's fixed frame in the parent's."""
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = joint.rotation, joint.translation
+    return out
+
+
+def pose_of(joint: Joint, q: list[Array], n: int) -> Array:
+    """Return the child's pose in the joint's frame, (n, 4, 4)."""
+    R, p = joint.type.placement(np, joint, q)
+    out = np.zeros((n, 4, 4))
+    for i, row in enumerate(R):
+        for j, x in enumerate((*row, p[i])):
+            out[:, i, j] = x
+    out[:, 3, 3] = 1.0
+    return out
 
 
 def inertia_box(body: Body) -> tuple[Array, Array]:
