@@ -25,6 +25,7 @@ from mbkit._check import axes_named as axes_named
 from mbkit.engines.evaluation import Evaluation
 from mbkit.errors import InputError
 from mbkit.model import Body, Frame, Model
+from mbkit.model.poses import frame_of
 from mbkit.model.quantities import QUANTITIES, of_groups
 from mbkit.spatial import skew
 
@@ -129,9 +130,7 @@ class FramesAndMomenta(Evaluation):
             # A frame of a body's name, as an MJCF has them, hides the body: X_WB = X_WF X_FB.
             frame = self.model.frame(body.name)
             if frame.translation.any() or not np.array_equal(frame.rotation, np.eye(3)):
-                X_BF = np.eye(4)
-                X_BF[:3, :3], X_BF[:3, 3] = frame.rotation, frame.translation
-                out[..., k, :, :] = out[..., k, :, :] @ np.linalg.inv(X_BF)
+                out[..., k, :, :] = out[..., k, :, :] @ np.linalg.inv(frame_of(frame))
         return out
 
     def jacobian(self, q: ArrayLike, frame: str | Sequence[str], axes: str = ALIGNED) -> Array:

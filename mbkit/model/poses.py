@@ -6,7 +6,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.model.description import Description
-from mbkit.model.parts import Body, Joint
+from mbkit.model.parts import Body, Frame, Joint
 
 
 def body_poses(model: Description, q: Array) -> dict[str, tuple[Array, Array]]:
@@ -19,10 +19,10 @@ def body_poses(model: Description, q: Array) -> dict[str, tuple[Array, Array]]:
     return {name: (x[:, :3, :3], x[:, :3, 3]) for name, x in X.items()}
 
 
-def frame_of(joint: Joint) -> Array:
-    """Return the joint's fixed frame in the parent's."""
+def frame_of(part: Joint | Frame) -> Array:
+    """Return the pose (4, 4) of a frame, or of a joint's fixed frame, in its body."""
     out = np.eye(4)
-    out[:3, :3], out[:3, 3] = joint.rotation, joint.translation
+    out[:3, :3], out[:3, 3] = part.rotation, part.translation
     return out
 
 

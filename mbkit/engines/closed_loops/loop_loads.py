@@ -26,6 +26,7 @@ from mbkit.model import Frame, Joint, Model
 from mbkit.model.elements.paths import Path
 from mbkit.model.loops import LOOP_KINDS, LOOP_ROWS, LoopEnds
 from mbkit.model.parts import Loop
+from mbkit.model.poses import frame_of
 
 LOOP_LOADS: Final = Path(
     "loads of loops", "", LOADS.carries, LOADS.why, asks=(frozenset(f"loop.{x}" for x in LOOP_KINDS), "it has no loops")
@@ -255,7 +256,7 @@ class LoopLoads(Actuation, Loads):
         total = {name: np.zeros(6) for name in X}
         for k, loop in enumerate(model.loops):
             last = first + len(LOOP_ROWS[loop.kind][0])
-            X_a, X_b, X_c = (X[f.body] @ _pose(f) for f in _frames_of(loop, k, model))
+            X_a, X_b, X_c = (X[f.body] @ frame_of(f) for f in _frames_of(loop, k, model))
             force, moment = _wrench(loop, X_a, X_b, X_c, shares[first:last])
             first = last
             own.append(np.concatenate([X_a[:3, :3].T @ x for x in (force, moment)]))
@@ -292,9 +293,3 @@ def _wrench(loop: Loop, X_a: Array, X_b: Array, X_c: Array, shares: Array) -> tu
             ends = LoopEnds(list(gap + 1e-30j * shift), list((A + 1e-30j * turned).T), list(B.T), loop.length)
             out[i + 3 * k] = shares @ np.imag(rows(ends)) * 1e30
     return R @ out[:3], R @ out[3:]
-
-
-def _pose(frame: Frame) -> Array:
-    X = np.eye(4)
-    X[:3, :3], X[:3, 3] = frame.rotation, frame.translation
-    return X
