@@ -28,7 +28,7 @@ import casadi as ca
 import numpy as np
 
 from mbkit._attributes import forwarded
-from mbkit._check import Array
+from mbkit._check import TYPED, Array
 from mbkit._reproducible import DEPENDENT, independent_rows
 from mbkit.derivation.body_motion import BodyMotion
 from mbkit.derivation.elements.arithmetic import casadi_arithmetic
@@ -50,8 +50,6 @@ from mbkit.model.validation import sample_mass_matrix
 #: Of the accelerations along a redundant row: what a stage of a long step leaves on its branch, and no other
 #: branch does.
 OFF_BRANCH: Final = 1e-2
-#: Gap of ends that can meet, relative to the mechanism's size, which a few typed digits leave.
-_MEETS: Final = 1e-9
 #: Height of a disc's centre over its radius below which it lies flat: there its height has a kink, where searches for a
 #: configuration end, and accelerations that grow with its inverse squared have lost 12 digits.
 _LIES: Final = 1e-6
@@ -416,7 +414,7 @@ def _with_something_to_say(numbers: _Numbers, poses: list[Array]) -> list[int]:
         # A position says nothing of a velocity that is not zero, and the other way round.
         alike = (np.array(rest, dtype=int)[:, None] < first) == (np.array(chosen, dtype=int) < first)
         left = sizes[0][own[rest]] - np.where(alike, weights, 0.0) @ sizes[0][own[list(chosen)]]
-        if (bad := np.flatnonzero(np.abs(left) > _MEETS * max(1.0, float(np.abs(sizes).max())))).size:
+        if (bad := np.flatnonzero(np.abs(left) > TYPED * max(1.0, float(np.abs(sizes).max())))).size:
             row = numbers.names[own[rest[int(bad[0])]]]
             what, way = ("the ends never meet", "between them; move or turn one end")
             if rest[int(bad[0])] >= first:

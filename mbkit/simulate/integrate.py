@@ -9,7 +9,7 @@ from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 
-from mbkit._check import EPS, Array, batch_of, real
+from mbkit._check import EPS, PRINTED, Array, batch_of, real
 from mbkit._warn import warn
 from mbkit.engines import Dynamics
 from mbkit.engines.base import DOUBLE_BITS
@@ -42,8 +42,6 @@ _MIN_RTOL_EXTENDED: Final = 1e-32
 _COST_IN_PYTHON: Final = 40
 #: Number of evaluations in machine code that take the time of one in a batch.
 _SIDE_BY_SIDE: Final = 8
-#: Largest difference of the period of a controller from a multiple of the step, in steps.
-_MAX_OFF_MULTIPLE: Final = 1e-6
 
 
 def integrate(
@@ -147,7 +145,7 @@ def _period(
         raise InputError("hold: expected a torque function, which is sampled; an array is held as it is")
     hold, eps = real("hold", request.hold, positive=True), EPS
     steps = hold / dt if dt else 1.0
-    if not (1 - _MAX_OFF_MULTIPLE <= steps < np.inf and abs(steps - round(steps)) <= _MAX_OFF_MULTIPLE):
+    if not (1 - PRINTED <= steps < np.inf and abs(steps - round(steps)) <= PRINTED):
         raise InputError(f"hold: expected a multiple of the step, {dt:g} s, got {hold:g} s")
     if not hold > 4 * eps * max(abs(start), abs(end)):
         raise InputError(f"hold: expected samples at times that differ, got {hold:g} s beside t = {end:g} s")
@@ -162,11 +160,11 @@ def _intervals(
 
     A table of wrenches, where there are `rows` of one, has a row between two `times`.
     """
-    count = max(1, int(np.ceil(duration / hold - _MAX_OFF_MULTIPLE)))
+    count = max(1, int(np.ceil(duration / hold - PRINTED)))
     ends: Array = np.append(start + hold * np.arange(count, dtype=float), start + duration)
     if times is not None and len(times):
         # A saved time that is a sample's to rounding is the same time.
-        inner, allowed = ends[1:-1], _MAX_OFF_MULTIPLE * hold
+        inner, allowed = ends[1:-1], PRINTED * hold
         near = times[np.minimum(np.searchsorted(times, inner - allowed), len(times) - 1)]
         ends[1:-1] = np.where(np.abs(near - inner) <= allowed, near, inner)
     if not rows or times is None:

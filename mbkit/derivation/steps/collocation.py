@@ -20,7 +20,7 @@ from typing import Any, Final
 
 import casadi as ca
 
-from mbkit._check import Array
+from mbkit._check import TYPED, Array
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.mass_matrix_solve import elimination_size
 from mbkit.derivation.steps.fixed import Part, at_time, function_of
@@ -32,8 +32,6 @@ from mbkit.methods.tableaus import ImplicitTableau, extrapolation_weights
 
 #: Number of steps through whose stages the first guess of the next ones is continued.
 _PAST_STEPS: Final = 2
-#: Largest difference of two times of stages that are one, in steps.
-_MAX_TIME_ROUNDING: Final = 1e-9
 #: Count of numbers of an unknown behind its stages.
 _JUDGEMENTS: Final = 2
 #: Largest ratio of corrections with which the iteration goes straight to the solution beside its guess (Kantorovich's
@@ -255,7 +253,7 @@ class Collocation:
             for end, x in zip(c, self._parts(self._symbols[name]), strict=True):
                 time = end - 1 - back
                 # A stage at the end of a step and one at the start of the next are at one time.
-                if not any(abs(time - other) < _MAX_TIME_ROUNDING for other in times):
+                if not any(abs(time - other) < TYPED for other in times):
                     times.append(time)
                     values.append(x)
         guesses = [_sum(weights, values) for weights in extrapolation_weights(times, c)]

@@ -21,12 +21,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import ITERATED, Array
 
 #: Each of the largest terms of a sum went through about this many roundings on the way.
 ROUNDINGS: Final = 4.0
-#: Singular values of redundant rows over the largest one.
-_REDUNDANT_SINGULAR_VALUE_RATIO: Final = 1e-11
 
 
 def epsilon(bits: int) -> float:
@@ -160,7 +158,7 @@ def condition_under_constraints(M: Array, J: Array) -> Array:
     zero = np.zeros((len(M), J.shape[1], J.shape[1]))
     whole = np.block([[scaled, rows.swapaxes(1, 2)], [rows, zero]])
     singular = np.linalg.svd(whole, compute_uv=False)
-    kept = np.where(singular > _REDUNDANT_SINGULAR_VALUE_RATIO * singular[:, :1], singular, np.inf)
+    kept = np.where(singular > ITERATED * singular[:, :1], singular, np.inf)
     return np.asarray(singular[:, 0] / kept.min(axis=1))
 
 

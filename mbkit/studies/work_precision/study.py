@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import EPS, Array, count, finite_array, real
+from mbkit._check import EPS, TYPED, Array, count, finite_array, real
 from mbkit.engines.registry import STANDARD, find_engine
 from mbkit.errors import InputError, NumericalError
 from mbkit.methods.registry import METHODS
@@ -30,8 +30,6 @@ from mbkit.studies.worker import check_executor
 #: An exact motion: from a time to q and v.
 Exact = Callable[[float], tuple[ArrayLike, ArrayLike]]
 
-#: A reference that starts farther than this from q0 and v0, rad or m, belongs to another motion.
-_MAX_START_GAP: Final = 1e-9
 #: The usual seconds of a study: base, for each velocity, and at the most.
 _BASE_SECONDS: Final = 60.0
 _SECONDS_PER_VELOCITY: Final = 10.0
@@ -256,7 +254,7 @@ def _start(
     q0, v0 = model.check_q(q, "q0"), model.check_v(v, "v0")
     if q0.ndim != 1 or v0.ndim != 1:
         raise InputError(f"q0, v0: expected one state, got shapes {q0.shape} and {v0.shape}")
-    if known is not None and float(np.abs(v0 - known.v[0]).max()) > _MAX_START_GAP:
+    if known is not None and float(np.abs(v0 - known.v[0]).max()) > TYPED:
         raise InputError("reference: does not start with v0; leave v0 out, or use the reference of this start")
     return q0, v0
 
@@ -283,7 +281,7 @@ def _truth(model: Model, q0: Array, duration: float, reference: Reference) -> Tr
         )
     if q.shape != (len(times), model.nq):
         raise InputError(f"reference: expected states of {model.nq} coordinates, got {q.shape}; it is of another model")
-    if float(np.abs(model.difference(q0, q[0])).max()) > _MAX_START_GAP:
+    if float(np.abs(model.difference(q0, q[0])).max()) > TYPED:
         raise InputError("reference: does not start at q0 (and v0); leave them out, or use the reference of this start")
     return Truth(times, q, floor, reference.how)
 
