@@ -213,6 +213,7 @@ def test_nothing_is_lost_on_the_way_to_json_and_back(study):
     assert partial.left_out == "the time allowed was used up: 1 of 1 cells were not run"
     assert partial.to_markdown().startswith(f"**stress**: {partial.left_out}; ")
     assert partial.headline.endswith("nothing was run")
+    assert not partial.document().good
     assert replace(partial, complete=False).headline.startswith("interrupted")
     for text in ("{}", "no JSON", '{"cases": [1]}', "[" * 100_000):
         with pytest.raises(InputError, match="StressResult"):

@@ -171,7 +171,7 @@ class StressResult(ResultTable):
         chosen = any(case._choice for case in self.cases)
         shown = [c for c in _CASES if chosen or c.head != "auto"]
         drawn = doc.Figure(
-            lambda: _drawn(self.cases), "How much of each sweep held: of each engine its furthest method."
+            lambda: _drawn(self.cases), "How much of each sweep the furthest method of each engine held."
         )
         key = doc.Details("how to read the tables", [Paragraph(_KEY)])
         return Document(
@@ -180,7 +180,7 @@ class StressResult(ResultTable):
             title="Stiff and extreme",
             verdict=self.headline,
             sentence=f"{self.headline}; {study}, each against a known truth",
-            good=bool(self.complete and self.cases and not silent),
+            good=bool(self.cases and not self.left_out and not silent),
             marked=False,
             summary=f"{len(self.cases)} cases · {runs} runs · {time_text(self.seconds)}",
             sections=[
