@@ -57,7 +57,7 @@ def require_same(batch: Any, alone: list, tolerance: float = 1e-9) -> None:
     assert len({e.t for e in batch.events}) > len(batch.events) // 2
 
 
-@pytest.mark.thorough("1-gauss4", "0-rk4")
+@pytest.mark.thorough("1-gauss4", "0-rk4", "0-gauss4")
 @pytest.mark.parametrize("method", ["rk4", "semi_implicit_euler", "gauss4"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_members_change_phases_at_their_own_times(method: str, seed: int) -> None:
@@ -150,7 +150,7 @@ def with_free_friction(seed: int, n: int = 3) -> tuple[Model, dict[str, np.ndarr
     return b.build(), values
 
 
-@pytest.mark.thorough("rk853", "semi_implicit_euler")
+@pytest.mark.thorough("rk853", "semi_implicit_euler", "rk4")
 @pytest.mark.parametrize("method", ["rk4", "semi_implicit_euler", "gauss4", "moreau", "rk853"])
 def test_samples_with_friction_of_their_own_are_models_with_these_numbers(method: str) -> None:
     model, values = with_free_friction(11)

@@ -36,6 +36,12 @@ BY_HAND = {"gpu.json": {"left out", "remarks"}, "derivation.json": {"python"}}
     "iftomm",
     "energy_drift",
     "accuracy",
+    "long_loops",
+    "near_redundant",
+    "versions",
+    "transfer",
+    "operations",
+    "mechanisms",
 )
 @pytest.mark.parametrize("name", PARTS)
 def test_a_part_runs_and_writes_what_is_kept(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

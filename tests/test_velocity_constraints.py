@@ -277,7 +277,14 @@ def eliminated(name: str) -> list[NonholonomicEquations]:
 
 
 @pytest.mark.thorough(
-    "ball on a table", "suslov in numbers", "car", "disc in body rates", "heavy suslov", "suslov", "disc"
+    "ball on a table",
+    "suslov in numbers",
+    "car",
+    "disc in body rates",
+    "heavy suslov",
+    "suslov",
+    "disc",
+    "sleigh in rates",
 )
 @pytest.mark.parametrize("name", ON_ONE_PAGE)
 def test_the_three_eliminations_print_the_same_text(name) -> None:
