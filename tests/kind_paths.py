@@ -547,9 +547,10 @@ def _loads(x: Example, folder: Path) -> Told:
 
 @column("quantities", "loads of loops", "loads of loops")
 def _loop_loads(x: Example, folder: Path) -> Told:
-    if not x.model.loops or sum(bool(p.rows or p.speeds) for p in x.plain.parts) > 1:
-        raise NotAskedError("no loop, or other rows beside it")
-    (wrench,), (loop,) = engine(x.name).loop_wrenches(x.q, x.v, x.tau), x.model.loops
+    wrenches = engine(x.name).loop_wrenches(x.q, x.v, x.tau)
+    if sum(bool(p.rows or p.speeds) for p in x.plain.parts) > 1:
+        raise NotAskedError("other rows beside the loop")
+    (wrench,), (loop,) = wrenches, x.model.loops
     F, T = loop.rotation_a @ wrench[:3], loop.rotation_a @ wrench[3:]
     k = x.links[loop.body_b]
     R, p = x.plain.poses(x.plain.q)[k]
@@ -560,8 +561,8 @@ def _loop_loads(x: Example, folder: Path) -> Told:
 
 @column("quantities", "forces of actuators", "actuator forces")
 def _actuators(x: Example, folder: Path) -> Told:
-    if not x.rows:
-        raise NotAskedError("no rows")
+    if not (x.rows or x.links):
+        raise NotAskedError("no bodies and no rows")
     a = x.accelerated()
     tau = engine(x.name).actuator_forces(x.q, x.v, a).tau
     return off(x.acceleration(x.t, x.plain.q, x.plain.v, tau), a)
