@@ -498,7 +498,7 @@ def test_a_fixed_step_passes_a_pose_wherever_it_lies_in_the_step(engine, options
 @pytest.mark.parametrize("method", ["rk4", "semi_implicit_euler"])
 @pytest.mark.parametrize("compiled", [True, False])
 def test_a_single_step_sees_a_pose_that_both_ends_are_as_far_from(compiled, method) -> None:
-    """Steps of 20 ms were off by 7e-3 rad/s, and machine code of the semi-implicit Euler method did not see the pose."""
+    """Steps of 20 ms were off by 7e-3 rad/s; machine code of the semi-implicit Euler method did not see the pose."""
     dyn, motion = kite(compile=compiled), kite_motion()
     for dt, close in ((4e-3, 1e-12), (2e-2, 1e-9)):
         for place in (0.44, 0.5, 0.5 + 1e-6, 0.55):
@@ -552,6 +552,41 @@ def test_an_adaptive_run_has_its_states_at_and_beside_a_pose(method, rtol, close
     assert run.stats.steps < 100
     off = run.q - [motion.at(x)[0] for x in t]
     assert np.abs(np.angle(np.exp(1j * off))).max() < close
+
+
+@pytest.mark.thorough(every=12)
+@pytest.mark.parametrize("place", [1e-9, -1e-9, 1e-8, 1e-7, -1e-6, 1e-5])
+@pytest.mark.parametrize("apart", [1e-4, 6e-4, 1e-3])
+@pytest.mark.parametrize(
+    ("method", "rtol"),
+    [("rk853", 1e-6), ("rk853", 1e-9), ("rk853", 1e-12), *((m, 1e-8) for m in ("dop853", "radau", "rodas5", "lsoda"))],
+)
+def test_short_intervals_of_a_held_torque_that_end_beside_a_pose_are_no_obstacle(method, rtol, apart, place) -> None:
+    """Most methods stopped there by name, and rk853 took minutes."""
+    motion, t = kite_motion(), apart * (np.arange(5) - 2 - place)
+    setting = {"rtol": rtol, "save": t - t[0], "torque": np.zeros((4, 3))}
+    run, _ = simulated(kite(), *motion.at(t[0]), t[-1] - t[0], method, **setting)
+    assert run.stats.finished
+    assert run.stats.steps < 40
+    off = run.q - [motion.at(x)[0] for x in t]
+    assert np.abs(np.angle(np.exp(1j * off))).max() < 1e-10
+
+
+@pytest.mark.thorough(every=4)
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("method", ["rk853", "rodas5", "auto", "dop853", "radau", "taylor", "lsoda", "bdf"])
+def test_states_saved_within_a_crossing_are_those_of_its_polynomial(method, compiled) -> None:
+    """Each cost 150 to 250 evaluations, 6 to 16 s for these, and was off by up to 1e-9."""
+    skip_without(method, "lagrangian")
+    motion, t = kite_motion(), np.linspace(0.0, 0.1, 501)
+    run, _ = simulated(kite(compile=compiled), *motion.at(-0.05), 0.1, method, rtol=1e-8, save=t)
+    assert run.stats.finished
+    assert run.stats.evaluations < 12 * len(t)
+    states = [motion.at(x - 0.05) for x in t]
+    off = run.q - [q for q, _ in states]
+    close = 1e2 if method in ("lsoda", "bdf") else 1.0
+    assert np.abs(np.angle(np.exp(1j * off))).max() < 1e-9 * close
+    assert np.abs(run.v - [v for _, v in states]).max() < 1e-8 * close
 
 
 @pytest.mark.thorough(every=12)

@@ -285,11 +285,14 @@ class CompiledAttempts:
         after[failed] = np.nan
         q, w = after[:, self._at["q"]], after[:, self._at["w"]]
         # A step across a singular pose is good, and yet a shorter one may have stages too near to it.
-        for i in failed if self._dyn._projects else ():
+        for begin in dict.fromkeys(start.t[failed].tolist()) if self._dyn._projects else ():
+            group = failed[start.t[failed] == begin]
             own = RungeKuttaAttempts(self._problem, self._space, self._of_place[place])
-            begin = start.rows(np.array([i]))
-            own.start([self._which[place]], begin.q, begin.w, float(begin.t[0]), _HUGE)
+            own.start([self._which[place]], start.q[group[:1]], start.w[group[:1]], begin)
             own.hold(self._k, self._stop)
-            q[i], w[i] = (x[0] for x in own.within(0, begin, times[i, None]))
             self._taken.append(own)
+            while own.now[0] < times[group[-1]] and (step := own.step()):
+                inside = group[(times[group] > step.t[0]) & (times[group] <= step.t[1])]
+                if len(inside):
+                    q[inside], w[inside] = own.within(0, step.rows(0 * inside), times[inside])
         return q, w

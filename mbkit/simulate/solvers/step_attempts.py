@@ -247,6 +247,14 @@ class RungeKuttaAttempts:
         self._stages.keep(0 if fresh else 1)
         return self._tableau.step(self._space, rates, self._stages, t, h, q, w)
 
+    def step(self) -> AcceptedSteps | None:
+        """Return the next step; None where there is none."""
+        while attempts := self.advance():
+            ((_, done),) = attempts
+            if len(done.t) > 1:
+                return done
+        return None
+
     def drop(self, place: int) -> None:  # noqa: ARG002  # there is one
         self._dropped = True
 
@@ -325,13 +333,9 @@ class AcrossPoses(RungeKuttaAttempts):
     def cross(self, k: int, stop: float) -> tuple[float, Array]:
         """Return the time and the state after a step under force k; `StoppedError` where there is none."""
         self.hold(k, stop)
-        while True:
-            ((_, done),) = self.advance()
-            if len(done.t) > 1:
-                break
-            if (reason := self.stuck(0)) is not None:
-                raise reason
-        self._last_step = done
+        self._last_step = done = self.step()
+        if done is None:
+            raise self.stuck(0) or below_rounding(self._wanted)
         return float(done.t[-1]), self._vector(done.q[-1], done.w[-1])
 
     def at(self, t: float) -> Array:
