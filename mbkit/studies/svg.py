@@ -9,15 +9,14 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
-from mbkit._escape import html, one_line
-from mbkit.simulate.plotting.style import POINTS, Palette, drawing, engine_mark
+from mbkit._escape import html
+from mbkit.simulate.plotting.style import POINTS, Palette, drawing
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 #: Stand-ins for the page's colours.
@@ -42,22 +41,6 @@ def page_style(salt: str) -> Iterator[None]:
     """Give the page's style, and the same names inside an SVG every time."""
     with drawing(PAGE, {"svg.hashsalt": f"mbkit {salt}"}):
         yield
-
-
-@contextmanager
-def canvas(
-    salt: str, height: float, width: float = PAGE_WIDTH_INCHES, panels: int = 1, columns: int = 1, **grid: Any
-) -> Iterator[tuple[Figure, list[Axes]]]:
-    """Give a figure, sized in inches, and the axes of so many panels, row by row."""
-    # Figure without pyplot: no window system, nothing to close.
-    from matplotlib.figure import Figure
-
-    with page_style(salt):
-        fig = Figure(figsize=(width, height))
-        axes = list(fig.subplots(math.ceil(panels / columns), columns, squeeze=False, **grid).flat)
-        for ax in axes[panels:]:
-            ax.remove()
-        yield fig, axes[:panels]
 
 
 def svg(fig: Figure, title: str) -> str:
@@ -107,17 +90,3 @@ def image(fig: Figure, ending: str = "png") -> bytes:
         fig.savefig(stream, format=ending, dpi=_DOTS_PER_INCH, facecolor="white", metadata=marks[ending])
     content = stream.getvalue()
     return _titled(content.decode()).encode() if ending == "svg" else content
-
-
-def page_legend(
-    fig: Figure, engines: Sequence[str], lines: Sequence[dict[str, Any]], left: float, size: float, **options: Any
-) -> None:
-    """Name the engines, by colour and marker, and further lines, above the figure."""
-    from matplotlib.lines import Line2D
-
-    handles = [
-        Line2D([], [], color=PAGE.engine(e), marker=engine_mark(e), ls="none", markersize=size, label=one_line(e, 30))
-        for e in engines
-    ]
-    handles += [Line2D([], [], **line) for line in lines]
-    fig.legend(handles=handles, loc="upper left", bbox_to_anchor=(left, 1.0), ncols=len(handles), **options)

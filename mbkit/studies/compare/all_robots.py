@@ -14,14 +14,14 @@ from mbkit.engines.registry import STANDARD
 from mbkit.errors import MbkitError, MbkitWarning, UnknownNameError
 from mbkit.load import load, robots
 from mbkit.load.loader import find
-from mbkit.simulate.plotting.style import log_ticks, name_points
+from mbkit.simulate.plotting.style import log_ticks, name_points, new_figure
 from mbkit.studies import document as doc
 from mbkit.studies import results
 from mbkit.studies.compare.figure import shown_error
 from mbkit.studies.compare.result import Comparison, states_text
 from mbkit.studies.compare.study import compare
 from mbkit.studies.formatting import error_text
-from mbkit.studies.svg import PAGE, canvas, svg
+from mbkit.studies.svg import PAGE, page_style, svg
 from mbkit.studies.worker import run
 
 Status = Literal["agree", "differ", "refused", "failed"]
@@ -154,7 +154,9 @@ def drawn_robots(result: Sweep) -> str:
         if (worst := c.worst) is not None:
             text = f"{robot}: {error_text(worst.relative)}, {worst.term} of {worst.engine}"
             groups.setdefault(c.engines, []).append((int(c.facts["nv"]), shown_error(worst.relative, 1e-17), text))
-    with canvas("robots", 3.4, 7.2) as (fig, (ax,)):
+    with page_style("robots"):
+        fig = new_figure(7.2, 3.4)
+        ax = fig.add_subplot()
         for k, (engines, points) in enumerate(groups.items()):
             nv, errors, texts = zip(*points, strict=True)
             look: dict[str, Any] = {"color": PAGE.series[k % 6], "label": ", ".join(engines)}

@@ -21,7 +21,7 @@ from mbkit.simulate.plotting.style import (
 )
 from mbkit.studies.compare.rows import Row, by_term
 from mbkit.studies.formatting import error_text, time_text
-from mbkit.studies.svg import PAGE, canvas, page_legend, page_style, svg
+from mbkit.studies.svg import PAGE, PAGE_WIDTH_INCHES, page_style, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -111,29 +111,34 @@ def term_costs(rows: Sequence[Row], engines: Sequence[str], tolerance: float) ->
 
     Terms that were not timed are left out; empty where none was.
     """
+    from matplotlib.lines import Line2D
+
     # An engine that stands in for the oracle has no error of its own.
     timed = [r for r in rows if math.isfinite(r.ns) and r.ns > 0 and r.engine != r.reference]
     terms = list(dict.fromkeys(r.term for r in timed))
     if not terms:
         return ""
-    height = 1.0 + 1.55 * math.ceil(len(terms) / _PANELS_PER_ROW)
-    margins = {"left": 0.07, "right": 0.995, "top": 1 - 0.6 / height, "bottom": 0.5 / height}
-    grid = {**margins, "wspace": 0.15, "hspace": 0.3}
-    shape: dict[str, Any] = {"panels": len(terms), "columns": _PANELS_PER_ROW, "sharex": True, "sharey": True}
-    with canvas("term costs", height, **shape, gridspec_kw=grid) as (fig, panels):
+    columns = min(_PANELS_PER_ROW, len(terms))
+    lines = math.ceil(len(terms) / columns)
+    with page_style("term costs"):
+        fig = new_figure(PAGE_WIDTH_INCHES, 1.0 + 1.55 * lines)
+        panels = list(fig.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).flat)
+        looks: dict[str, dict[str, Any]] = {
+            one_line(e, 30): {"color": PAGE.engine(e), "marker": engine_mark(e), "markersize": 7, "linestyle": "none"}
+            for e in engines
+        }
         level: dict[str, Any] = {"color": PAGE.muted, "linewidth": 0.9}
         dashed = {**level, "linestyle": (0, (4, 3))}
-        for ax, term in zip(panels, terms, strict=True):
+        for ax, term in zip(panels, terms, strict=False):
             ax.axhline(EPS, **level)
             ax.axhline(tolerance, **dashed)
-            for row in timed:
-                if row.term == term:
-                    place = [row.ns], [shown_error(row.relative, _MIN_DRAWN_ERROR)]
-                    point = ax.plot(*place, engine_mark(row.engine), color=PAGE.engine(row.engine), markersize=7)
-                    spent = time_text(row.ns * 1e-9)
-                    name_points(point, [f"{term}, {row.engine}: worst error {error_text(row.relative)} in {spent}"])
-                    if not row.passed:
-                        ax.plot(*place, "x", color=PAGE.bad, **CROSS)
+            for row in (r for r in timed if r.term == term):
+                place = [row.ns], [shown_error(row.relative, _MIN_DRAWN_ERROR)]
+                spent = time_text(row.ns * 1e-9)
+                text = f"{term}, {row.engine}: worst error {error_text(row.relative)} in {spent}"
+                name_points(ax.plot(*place, **looks[one_line(row.engine, 30)]), [text])
+                if not row.passed:
+                    ax.plot(*place, "x", color=PAGE.bad, **CROSS)
             ax.set_title(one_line(term, 28), loc="left", fontsize=9.5, pad=3)
         panels[0].set_xscale("log")
         panels[0].set_yscale("log")
@@ -143,9 +148,12 @@ def term_costs(rows: Sequence[Row], engines: Sequence[str], tolerance: float) ->
         for k, ax in enumerate(panels):
             ax.grid(which="major")
             log_ticks(ax, 5)
-            ax.tick_params(labelsize=8.5, labelbottom=k + _PANELS_PER_ROW >= len(terms))
-        fig.text(0.53, 0.0, "time of one call, ns", ha="center", va="bottom")
-        fig.text(0.0, 0.5, "worst relative error", rotation=90, ha="left", va="center")
-        levels = [level | {"label": "eps of double precision"}, dashed | {"label": f"tolerance {tolerance:g}"}]
-        page_legend(fig, engines, levels, 0.03, 7.0, columnspacing=1.8)
+            ax.tick_params(labelsize=8.5, labelbottom=k + columns >= len(terms))
+        for ax in panels[len(terms) :]:
+            ax.remove()
+        fig.supxlabel("time of one call, ns", fontsize=10.0)
+        fig.supylabel("worst relative error", fontsize=10.0)
+        looks |= {"eps of double precision": level, f"tolerance {tolerance:g}": dashed}
+        handles = [Line2D([], [], label=label, **look) for label, look in looks.items()]
+        legend(panels[0], handles, "upper", own=True, columns=7)
         return svg(fig, "Error of each term against the time of a call")
