@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit.engines.elements.jumps import friction_forces
+from mbkit.engines.elements.jumps import jump_forces
 from mbkit.model import Model
 from tests.random_trees import off
 
@@ -147,7 +147,7 @@ def test_of_several_patterns_it_is_that_of_a_stribeck_velocity_that_goes_to_zero
     while t < 400:
         now = f + (s - f) * np.exp(-np.square(w))
         # With the friction of motion alone, this is the problem of impulses that has one answer.
-        force, holds = friction_forces(A, a0 + w / h, now, now, alike, none)
+        force, holds = jump_forces(A, a0 + w / h, now, now, alike, none)
         w = np.where(holds, 0.0, w + h * (a0 + np.einsum("nij,nj->ni", A, force)))
         t, h = t + h, min(1.01 * h, 1.0)
     a = mb.dynamics(chain(f, s, masses), "lagrangian").forward_dynamics(q, 0 * q, tau)
@@ -159,7 +159,7 @@ def test_joints_that_are_alike_let_go_alike_whatever_the_rounding() -> None:
     A, one = np.array([[1.0, 0.5], [0.5, 1.0]]), np.ones((1, 2))
     for tilt in (0.0, 1e-14, -1e-14):
         b = A @ np.array([2.5, 2.5 + tilt])
-        forces, holds = friction_forces(A[None], b[None], 2 * one, one, one > 0, 0 * one)
+        forces, holds = jump_forces(A[None], b[None], 2 * one, one, one > 0, 0 * one)
         assert not holds.any()
         assert forces.tolist() == [[-1.0, -1.0]]
 

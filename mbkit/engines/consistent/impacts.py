@@ -70,7 +70,7 @@ def impact(
     jacobian : (k, nv) or (N, k, nv) array_like, optional
         G: the velocities G v are those of the contact, such as rows of `Dynamics.jacobian`.
     restitution : float
-        e from 0, where G v⁺ = 0, to 1, where frictionless contacts lose no energy unless constraints move.
+        e from 0, where G v⁺ = 0, to 1, where contacts lose no energy unless constraints move.
 
     Raises
     ------

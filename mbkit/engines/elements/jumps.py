@@ -127,7 +127,7 @@ def _restricted(A: Array, right: Array, on: Mask, *, definite: bool = True) -> A
     return np.asarray(x[..., 0])
 
 
-def friction_forces(
+def jump_forces(
     A: Array, b: Array, bound: Array, less: Array, on: Mask, known: Array, *, definite: bool = True
 ) -> tuple[Array, Mask]:
     """Return the forces of friction at rest, and which of them hold; those `known` do not; (N, n).
@@ -299,7 +299,7 @@ class Jumps(AddedForce):
         bound, less = (np.broadcast_to(x, on.shape) for x in (law.bound, law.just_moving))
         known = np.zeros(on.shape) if leaving is None else (-leaving * law.just_moving).reshape(on.shape)
         definite = not self._constrained
-        forces, holds = friction_forces(A, b, bound, less, on, known, definite=definite)
+        forces, holds = jump_forces(A, b, bound, less, on, known, definite=definite)
         # A has the rounding of M; what the engine's own accelerations still leave corrects that.
         left = accelerate(tau + padded(forces.reshape(shape), tau))
         left = np.asarray(left, dtype=np.float64).reshape(on.shape)

@@ -1,4 +1,4 @@
-"""Runs by Moreau and Jean's step: dry friction with a fixed step, any number of joints, no events.
+"""Runs by Moreau and Jean's step: forces that jump with a fixed step, at any number of joints, without events.
 
 On the own derivation the step with its choice of sides is machine code; elsewhere, beside constraints, and under
 torques that are functions, the same problem is solved in Python for each step.
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
-from mbkit.engines.elements.jumps import friction_forces
+from mbkit.engines.elements.jumps import jump_forces
 from mbkit.errors import FunctionError, NumericalError
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
@@ -27,7 +27,7 @@ from mbkit.simulate.solvers.vector_field import DIVERGED, DivergenceError
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
 
-#: Attempts at once, and the most for one step for each velocity with friction.
+#: Attempts at once, and the most for one step for each velocity with a force that jumps.
 _ROUNDS: Final = 512
 _PATIENCE: Final = 40
 _RUNAWAY: Final = 1e100
@@ -88,7 +88,7 @@ class _Stepper(Stepper):
         none = np.zeros((len(members), dyn.model.nv))
         self._law = dyn._jumps.law_of(dyn)
         self._rubs = np.broadcast_to(self._law.bound > 0, none.shape)
-        # Without friction: neither a side nor rest.
+        # Nothing jumps there: neither a side nor rest.
         self._smooth = self._phases.given(none, none > 0, none > 0, dyn).dyn if self._rubs.any() else dyn
 
     def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
@@ -124,7 +124,7 @@ class _Stepper(Stepper):
             while True:
                 most = h * np.where(rests, self._law.bound, slides)
                 given = inverse, smooth, most, h * slides, self._rubs, np.zeros(v.shape)
-                impulse, holds = friction_forces(*given, definite=not bound)
+                impulse, holds = jump_forces(*given, definite=not bound)
                 free = np.where(holds, 0.0, smooth + (inverse @ impulse[..., None])[..., 0])
                 if not (turns := self._rubs & ~rests & (v * free <= 0) & (slides < self._law.bound)).any():
                     break
