@@ -128,7 +128,7 @@ def test_a_kind_acts_alone_and_is_taken_out(name: str) -> None:
         assert name in ("mimic", "energies", "written.row", "written.speed", "written.t")
 
 
-@pytest.mark.parametrize("gate", registered())
+@pytest.mark.parametrize("gate", sorted(registered()))
 def test_a_gate_names_each_part_that_it_refuses(gate: str) -> None:
     own = GATES[gate]
     # A beam is one part, and many joints.
