@@ -173,10 +173,6 @@ def warn_of_negative(
 
 # The inverse of a matrix in symbols, block by block.
 
-# Above this size cofactors grow faster than elimination does.
-_MAX_COFACTOR_ROWS: Final = 4
-
-
 def inverse(A: Any, what: str) -> sp.ImmutableMatrix:
     """Return A⁻¹ with each entry tidied, coupled block by coupled block; InputError names `what` if A is singular."""
     A = sp.Matrix(A)
@@ -186,10 +182,7 @@ def inverse(A: Any, what: str) -> sp.ImmutableMatrix:
         det = settled(part.det(method="berkowitz"))
         if det == 0:
             raise InputError(f"{what}: {part.tolist()} is singular everywhere")
-        if len(block) <= _MAX_COFACTOR_ROWS:
-            turned = part.adjugate(method="berkowitz") / det
-        else:
-            turned = part.LUsolve(sp.eye(len(block)))
+        turned = part.adjugate(method="berkowitz") / det
         for i, row in enumerate(block):
             for j, column in enumerate(block):
                 out[row, column] = settled(turned[i, j])
