@@ -7,7 +7,7 @@ on (q, v) as here.
 
 from __future__ import annotations
 
-from math import sqrt
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mbkit._check import EPS, Array
 from mbkit.methods.tableaus import ImplicitTableau, extrapolation_weights, gauss_legendre
 from mbkit.model.integration_space import Space
-from mbkit.simulate.singular_poses import LOOSEST, time_ahead, undetermined
+from mbkit.simulate.singular_poses import time_ahead, undetermined
 from mbkit.simulate.solvers.vector_field import DIVERGED, DivergenceError, Field
 from mbkit.simulate.torque import Force
 
@@ -33,13 +33,8 @@ _MAX_VELOCITY_ROUNDING: Final = 1e-11
 _MAX_MOVE_ROUNDING: Final = 1e-13
 #: Largest difference of two times that are one, in steps.
 _MAX_TIME_ROUNDING: Final = 1e-9
-#: Difference of states by which slopes near a singular pose are found, relative to the way of the step.
-_DIFFERENCE_NEAR_POSE: Final = 1e-4
-#: Distance of a pose from the start of a step, in its lengths, up to which it is at the start: behind it are all stages
-#: but one. One that is farther has to be in the middle, as at most other places f̈ = 0 at the stages leaves the
-#: distance from the constraints open, and most of all near the end.
-AT_START: Final = 0.05
-#: Distance of a pose from the start in lengths of the step from which it is far behind the end.
+#: Distance of a pose from the start, in lengths of the step, from which it is far behind the end. Near the end f̈ = 0 at
+#: the stages leaves the distance from the constraints open.
 AT_END: Final = 1.5
 _UNSOLVED: Final = "the iteration does not solve the equations of the step's stages"
 
@@ -73,7 +68,6 @@ class CollocationStep:
         self._A, self._b, self._c, self._s = tableau.A, tableau.b, tableau.c, tableau.stages
         self._times = tableau.c.tolist()
         self._field, self._space, self._nv, self._near_pose = field, space, space.nv, near_pose
-        self._rounding = LOOSEST if near_pose else _MAX_VELOCITY_ROUNDING
         # The last step, and the one before, from which it may be tried again.
         self._past: list[_Past] = []
 
@@ -174,7 +168,9 @@ class CollocationStep:
             rest = size * factor / (1 - factor)
         done = (size <= EPS * speed) | (measurable & (factor < 1) & (rest <= EPS / 4 * speed))
         done |= (
-            measurable & (factor > 0.5) & ((size <= self._rounding * speed) | (start.h * size <= _MAX_MOVE_ROUNDING))
+            measurable
+            & (factor > 0.5)
+            & ((size <= _MAX_VELOCITY_ROUNDING * speed) | (start.h * size <= _MAX_MOVE_ROUNDING))
         )
         return done, measurable & ~(factor < _MAX_CONTRACTION)
 
@@ -204,10 +200,7 @@ class CollocationStep:
     def _slopes(self, start: _Start, c: float, u: Array, w: Array) -> Array:
         """Return J = ∂(u̇, ẇ)/∂(u, w) by differences: half of the digits are enough for the iteration."""
         nv = self._nv
-        speed = float(np.abs(w).max(initial=0.0))
-        size = sqrt(EPS) * max(1.0, speed)
-        if self._near_pose and speed:
-            size = min(size, _DIFFERENCE_NEAR_POSE * start.h * speed)
+        size = math.sqrt(EPS) * max(1.0, float(np.abs(w).max(initial=0.0)))
         J = np.empty((*w.shape[:-1], 2 * nv, 2 * nv))
         there, moved = np.empty(J.shape[:-1]), np.empty(J.shape[:-1])
         y = np.concatenate([u, w], axis=-1)
@@ -244,10 +237,11 @@ class StepPolynomial:
 
 
 class StepNearPose:
-    """Steps near a singular pose: of Gauss's collocation, with a pose within one in the middle of it.
+    """Steps of one state near a singular pose, by Gauss's collocation, which Newton's iteration solves.
 
     f̈ = 0 divides the stages' distance from the constraints by J's smallest singular value. Those of collocation are
-    close to the motion, none is at an end, which may be the pose, and none of an even number is in the middle.
+    close to the motion, and none is at an end, which may be the pose. A polynomial that ends at the pose or soon behind
+    it is not determined, and one that goes twice as far as the pose is.
     """
 
     def __init__(self, field: Field, space: Space, stages: int) -> None:
@@ -255,32 +249,20 @@ class StepNearPose:
         self._field, self._space, self._times = field, space, tableau.c
         self._collocation = CollocationStep(tableau, field, space, near_pose=True)
 
-    def part(
-        self, t: float, h: float, stop: float, q: Array, w: Array, force: Force, reach: float = 1.0
-    ) -> tuple[float, StepPolynomial]:
-        """Return a step of one state over about h seconds, and its end, which is not behind the stop.
-
-        Its polynomial may be `reach` times as long, and longer where a pose is near its end.
-        """
+    def part(self, t: float, h: float, stop: float, q: Array, w: Array, force: Force) -> tuple[float, StepPolynomial]:
+        """Return the end of a step over at least h seconds, which is not behind the stop, and the step's polynomial."""
         v = self._space.to_body_velocity(q, w)
         ahead = float(np.ravel(time_ahead(self._field.dyn, t, q, v))[0])
         if not ahead and (why := undetermined(self._field.dyn, t, q, v)):
             raise DivergenceError(f"the motion is {why}")
         if 0 < ahead < AT_END * h:
-            h *= reach
-            h = h if ahead <= AT_START * h else 2 * ahead
+            h = max(h, 2 * ahead)
         rates = self._collocation.rates(t, h, q, w, force)
         return min(t + h, stop), StepPolynomial(self._space, self._times, _Start(t, h, q, w, force), rates)
 
     def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
         """Return q and w of one state after h seconds."""
-        end = t + h
-        while True:
-            t, step = self.part(t, end - t, end, q, w, force)
-            q, w = step.at(t)
-            if not t < end:
-                return q, w
-            q, w = self._field.settled(t, q, w)
+        return self.part(t, h, math.inf, q, w, force)[1].at(t + h)
 
 
 def _inverse_of(coupled: Array) -> Array:

@@ -33,7 +33,7 @@ from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.diagnostics.stiffness import RateJacobian
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.singular_poses import AHEAD, LOOSEST, Approach
-from mbkit.simulate.solvers.gauss import AT_END, AT_START, StepNearPose, StepPolynomial
+from mbkit.simulate.solvers.gauss import AT_END, StepNearPose, StepPolynomial
 from mbkit.simulate.solvers.trajectory_record import AcceptedSteps, StoppedError, below_rounding, diverged
 from mbkit.simulate.solvers.vector_field import DivergenceError, Field, Rates
 from mbkit.simulate.torque import Force
@@ -178,9 +178,6 @@ class RungeKuttaAttempts:
         end, q, w, self._error = self._checked_attempt(end, self._attempt_near_pose if near else self._attempt)
         good = self._error < 1 and step > 0
         self._settle(step, good)
-        if near and not good and self.approach.ahead > AT_START * self._reach * step:
-            # To beside the pose: a shorter step to behind it would be of the same polynomial.
-            self._h = min(self._h, float(self.approach.ahead) / AT_END)
         return [(0, _accepted(start, self._arrive(end, q, w)) if good else _accepted(start))]
 
     def _arrive(self, t: float, q: Array, w: Array) -> tuple[float, Array, Array]:
@@ -217,8 +214,8 @@ class RungeKuttaAttempts:
         return end, q, w, float(error)
 
     def _attempt_near_pose(self, end: float) -> tuple[float, Array, Array, float]:
-        start = self._q, self._w, self._force
-        end, part = self._near_pose.part(self._t, end - self._t, self._stop, *start, self._reach)
+        h = self._reach * (end - self._t)
+        end, part = self._near_pose.part(self._t, h, self._stop, self._q, self._w, self._force)
         q, w = part.at(end)
         self._within_last, self._fresh = part, True
         by_u, _ = self._scales(q, w, part.last, LOOSEST)
