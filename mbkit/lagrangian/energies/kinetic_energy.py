@@ -173,6 +173,7 @@ def warn_of_negative(
 
 # The inverse of a matrix in symbols, block by block.
 
+
 def inverse(A: Any, what: str) -> sp.ImmutableMatrix:
     """Return A⁻¹ with each entry tidied, coupled block by coupled block; InputError names `what` if A is singular."""
     A = sp.Matrix(A)
