@@ -281,3 +281,20 @@ def test_the_least_of_two_margins_that_end_together_is_found_in_few_rounds() -> 
     found = first_zero(margins, margins(np.zeros(2), both), margins(np.ones(2), both))
     assert np.abs(found - roots.min(axis=1)).max() < 4 * EPS
     assert len(rounds) < 20
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "mujoco"])
+def test_what_stands_for_ever_is_that_of_steps_that_hold_it(engine: str) -> None:
+    b = mb.ModelBuilder.of(mb.catalog.double_pendulum())
+    for joint in b.build().joints:
+        b.set_joint(joint.name, friction=30.0)
+    dyn, q, v = mb.dynamics(b.build(), engine), np.array([[0.3, -0.2], [1.0, 0.5]]), np.zeros(2)
+    push = np.array([1.0, -2.0])
+    held, stepped = (mb.simulate(dyn, q, v, DURATION, dt=STEP, torque=x) for x in (push, np.tile(push, (STEPS, 1))))
+    assert (held.q == stepped.q).all()
+    assert (held.q == q[:, None]).all()
+    assert not held.v.any()
+    assert held.stats.steps == stepped.stats.steps
+    assert held.stats.evaluations == 0 < stepped.stats.evaluations
+    loose = mb.simulate(dyn, q, v, DURATION, dt=STEP, torque=50 * push)
+    assert abs(loose.v[:, 1]).min() > 0

@@ -209,10 +209,14 @@ class _Members:
         grid, record, k = self.problem.grid, self._record, self.k[rows]
         phase = self._phase if len(rows) == len(self.k) else self._phase.take(rows)
         start = grid.time(int(k.min()))
-        compiled = phase.still.any() and self._compiled(phase.dyn)
+        stands = self._stands(phase)
+        compiled = phase.still.any() and self._compiled(phase.dyn) and not stands
         margins = np.empty((len(rows), n)) if compiled and self.side_by_side else None
         together, *room = self._room(rows, k, n)
-        result = self._solved(rows, phase, n, Grid(start, start + n * h, h, n, h), margins, room)
+        if stands:
+            every = np.arange(len(rows)), np.zeros(len(rows), dtype=np.intp), np.full(len(rows), start)
+            margins = np.repeat(self._of_states(rows, phase, *every, self.q[rows], self.v[rows]).min(1)[:, None], n, 1)
+        result = self._solved(rows, phase, n, Grid(start, start + n * h, h, n, h), None if stands else margins, room)
         q, v = (x if self.side_by_side else x[None] for x in (result.q, result.v))
         count = q.shape[1]
         for here, x in zip(room, (q, v), strict=True):
@@ -300,7 +304,11 @@ class _Members:
             q, v = self.q[0], self.v[0]
         silent, every = Progress(None, ""), np.arange(n + 1, dtype=np.intp)
         own = IntegrationProblem.on_grid(phase.dyn, problem.method, q, v, grid, every, torque, silent)
-        if margins is None and (not room or phase.dyn.model.constrained or not self._compiled(phase.dyn)):
+        if self._stands(phase):
+            apart = GridRecord(own, *room)
+            apart.q[:], apart.v[:], apart.good[:] = own.q[:, None], own.v[:, None], n
+            out = apart.result()
+        elif margins is None and (not room or phase.dyn.model.constrained or not self._compiled(phase.dyn)):
             out = self._solver(phase.dyn)(own)
         else:
             from mbkit.simulate.solvers.compiled_fixed_step import run_rollout
@@ -312,6 +320,11 @@ class _Members:
         self._record.count(out)
         self._record.doubts += out.doubts
         return out
+
+    def _stands(self, phase: Phase) -> bool:
+        """Whether nothing moves, and nothing acts that changes with time."""
+        torque = self.problem.torque
+        return bool(phase.still.all()) and not (torque.held or torque.callable or self._timed)
 
     def _good(
         self,
