@@ -233,7 +233,7 @@ def divergence_reason(dyn: Dynamics, method: str, t: float, h: float, q: Array, 
 def make_step(method: str, field: Field, space: Space) -> Step:
     """Return the step of a fixed-step method, of one state or a batch; under constraints its end is to be projected.
 
-    The states at its ends and its middle alone decide whether it is a `StepNearPose`.
+    The states at its ends and its middle alone decide whether it is a `StepNearPose`: no end of a step is looked at.
     """
     formula = method_of(method).formula
     if isinstance(formula, ImplicitTableau):
@@ -242,6 +242,7 @@ def make_step(method: str, field: Field, space: Space) -> Step:
         assert isinstance(formula, (Tableau, SemiImplicitEuler))
         attempt = _ExplicitStep(formula, field, space)
     near_pose = StepNearPose(field, space, STAGES_NEAR_POSE)
+    field.looks = False
 
     def step(t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
         if not field.projects:
