@@ -597,7 +597,8 @@ def test_the_assert_names_the_number_and_can_ignore(tmp_path):
         tmp_path, Link("a", density=1e3 * checks.LEAD_DENSITY), Link("b", "a", density=1.5 * checks.LEAD_DENSITY)
     )
     with pytest.raises(
-        AssertionError, match=r"1 findings that are sure or likely\n  a: .* kg/m³ \(density, sure\); expected"
+        AssertionError,
+        match=r"1 finding on .*: 1 sure\n  link or joint a, check density, sure, found .* kg/m³, expected 10",
     ):
         assert_plausible(path)
     for ignore in (["density"], ["a"], ["a: *"], ["?"]):

@@ -233,7 +233,10 @@ def to_text(shown: Document, most: int = 0) -> str:
         if isinstance(block, Items):
             texts = [bullet.line for bullet in block.bullets]
         elif isinstance(block, Table):
-            texts = [", ".join(filter(None, row)) for row in _texts(block, "both")][1:]
+            heads, *rows = _texts(block, "both")
+            heads = [" ".join(head.split()) for head in heads]
+            named = ([f"{head} {x}".strip() for head, x in zip(heads, row, strict=True) if x] for row in rows)
+            texts = [", ".join(row) for row in named]
         lines += [f"  {plain(text)}" for text in texts[: most or None]]
         lines += [f"  and {len(texts) - most} more"] if most and len(texts) > most else []
     return "\n".join(lines)
