@@ -7,9 +7,9 @@ a sibling's. ``python -m validation.bodies`` compares all robots in all terms.
 
 from __future__ import annotations
 
-import sys
 import warnings
 from functools import partial
+from importlib import import_module
 
 import pytest
 
@@ -75,7 +75,7 @@ def without_accelerations(*_):
 @pytest.mark.thorough(every=14)
 @pytest.mark.parametrize("robot", [r.name for r in mb.robots()])
 def test_robot(monkeypatch, robot):
-    study = sys.modules["mbkit.studies.compare.study"]
+    study = import_module("mbkit.studies.compare.study")
     # Each call once; tests/test_compare.py has the times.
     monkeypatch.setattr(study, "interleaved", partial(study.interleaved, rounds=1, budget=0.0))
     if sibling := robot not in WHOLE:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import sys
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -57,20 +57,20 @@ HINGE = {"axis": (0, 1, 0)}
 @pytest.fixture(autouse=True)
 def untimed(monkeypatch):
     """Call each term once where its time is asked for: this file's other tests are not about times."""
-    study = sys.modules["mbkit.studies.compare.study"]
+    study = import_module("mbkit.studies.compare.study")
     monkeypatch.setattr(study, "interleaved", partial(interleaved, rounds=1, budget=0.0))
 
 
 @pytest.fixture
 def brief(monkeypatch):
     """Leave little time to error against run time, where a test asks for something else."""
-    monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "_MAX_SECONDS", 0.5)
+    monkeypatch.setattr(import_module("mbkit.studies.compare.study"), "_MAX_SECONDS", 0.5)
 
 
 @pytest.fixture
 def of_motion(monkeypatch):
     """Leave out the terms of bodies, where a test is about one of the equation of motion or about none."""
-    monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "BODY_TERMS", ())
+    monkeypatch.setattr(import_module("mbkit.studies.compare.study"), "BODY_TERMS", ())
 
 
 def terms(model, **kwargs):
@@ -605,7 +605,7 @@ def test_timings_are_medians_per_call_by_one_clock(monkeypatch):
     """Calls of 10 µs, and of 1 ms in which every third takes 3 ms, on a clock that only they advance."""
     now, calls = [0.0], itertools.count()
     monkeypatch.setattr(
-        sys.modules["mbkit.studies.compare.errors"], "time", SimpleNamespace(perf_counter=lambda: now[0])
+        import_module("mbkit.studies.compare.errors"), "time", SimpleNamespace(perf_counter=lambda: now[0])
     )
 
     def spend(seconds):

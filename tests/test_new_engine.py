@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
+from importlib import import_module
 from importlib.metadata import EntryPoint
 
 import numpy as np
@@ -38,7 +38,7 @@ def test_it_evaluates_and_simulates(engine):
 
 
 def test_it_is_compared_and_shown(engine, monkeypatch):
-    monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "_MAX_EVALUATIONS", 1_000)
+    monkeypatch.setattr(import_module("mbkit.studies.compare.study"), "_MAX_EVALUATIONS", 1_000)
     result = mb.compare(PENDULUM, ("lagrangian", engine), 2)
     assert result.passed
     assert {r.engine for r in result.rows} >= {engine}

@@ -11,9 +11,9 @@ import math
 import multiprocessing
 import os
 import pickle
-import sys
 import warnings
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from importlib import import_module
 from types import SimpleNamespace
 
 import numpy as np
@@ -58,7 +58,7 @@ def set_clock(monkeypatch, seconds_per_look):
     def clock():
         return seconds_per_look * next(looks)
 
-    sweep = sys.modules["mbkit.studies.work_precision.sweep"]
+    sweep = import_module("mbkit.studies.work_precision.sweep")
     monkeypatch.setattr(sweep, "time", SimpleNamespace(perf_counter=clock, process_time=clock))
 
 
