@@ -38,7 +38,7 @@ def test_a_gate_that_forgets_a_kind_or_lets_one_pass_is_noticed(gate: str, mutat
     assert survivors(mutation, gate, tmp_path, most=1) == []
 
 
-@pytest.mark.thorough(every=17)
+@pytest.mark.thorough(every=19)
 @pytest.mark.parametrize("path", COLUMNS)
 def test_a_path_without_a_part_is_not_right(path: str, tmp_path: Path) -> None:
     assert survivors("removed", path, tmp_path, most=1) == []

@@ -15,6 +15,7 @@ DECISIVE: Final = (
     "methods",
     "model",
     "lagrangian",
+    "engines/derived.py",
     "engines/lagrangian.py",
     "engines/constraint_manifold.py",
     "spatial.py",
