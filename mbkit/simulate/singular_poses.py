@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 #: Tightest tolerance of states within a step near a singular pose: f, whose rounding is never zero, is divided by the
 #: distance from the pose. The end of the step is closer.
-LOOSEST: Final = 1e-9
+LOOSEST: Final = 1e-10
 #: Steps within which a pose is near. At a third of the way a series of the tightest tolerance never arrives.
 AHEAD: Final = 4
 #: Ends of steps that decide on one of them, and the parts of it at which it is looked at too.
