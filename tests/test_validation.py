@@ -18,31 +18,6 @@ STAMP = {"date", "versions", "processor", "simd", "code"}
 BY_HAND = {"gpu.json": {"left out", "remarks"}, "derivation.json": {"python"}}
 
 
-@pytest.mark.thorough(
-    "work_precision",
-    "friction",
-    "bench_terms",
-    "flexible",
-    "stress",
-    "matrix",
-    "importers",
-    "lint",
-    "identification",
-    "readme_figure",
-    "bodies",
-    "auto",
-    "bench_derivation",
-    "gpu",
-    "iftomm",
-    "energy_drift",
-    "accuracy",
-    "long_loops",
-    "near_redundant",
-    "versions",
-    "transfer",
-    "operations",
-    "mechanisms",
-)
 @pytest.mark.parametrize("name", PARTS)
 def test_a_part_runs_and_writes_what_is_kept(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
