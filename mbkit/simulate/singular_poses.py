@@ -222,10 +222,15 @@ class SingularPoses:
 
     def _decide(self, k: int) -> None:
         """Look for a pose in the step that ends at the state k of those that are kept."""
-        if k < 1 or not self._new_since(self._seen[max(k - 2, 0)][0]):
+        seen = self._seen
+        if k < 1 or (k > 1 and seen[k - 1][1] > seen[k - 2][1]) or (k + 1 < len(seen) and seen[k][1] > seen[k + 1][1]):
             return
-        t, s, q = (list(x) for x in zip(*self._seen, strict=True))
-        if not (s[k - 1] <= min(s[max(k - 2, 0) : k]) and s[k] <= min(s[k : k + 2])):
+        if not self._new_since(seen[max(k - 2, 0)][0]):
+            return
+        t, s, q = (list(x) for x in zip(*seen, strict=True))
+        passed = [*s[:k], *(-x for x in s[k:])]
+        if 1 < k < len(s) - 1 and not _bend(t, passed) < _bend(t, s):
+            # Ends on both sides tell that none is here, and cost no evaluation.
             return
         model, h = self._dyn.model, t[k] - t[k - 1]
         way = model.difference(q[k - 1], q[k])
@@ -237,8 +242,7 @@ class SingularPoses:
             _bend(times, np.where(np.arange(len(sizes)) < i, sizes, -sizes)) for i in range(k, k + len(inner) + 1)
         )
         if min(turned) < _bend(times, sizes):
-            signed = np.where(np.arange(len(s)) < k, s, np.negative(s))
-            roots = np.roots(np.polyfit(np.array(t) - t[k - 1], signed, len(s) - 1))
+            roots = np.roots(np.polyfit(np.array(t) - t[k - 1], passed, len(s) - 1))
             within = roots[np.isreal(roots) & (roots.real >= 0) & (roots.real <= h)].real
             nearest = k - 1 if s[k - 1] < s[k] else k
             self._passed(t[k - 1] + float(within[0]) if len(within) else t[nearest], t[nearest], q[nearest])
