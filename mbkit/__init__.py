@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from mbkit.engines import Dynamics as Dynamics
     from mbkit.engines import dynamics as dynamics
     from mbkit.engines import engine as engine
+    from mbkit.engines.applications.impacts import Impact as Impact
+    from mbkit.engines.applications.impacts import impact as impact
     from mbkit.engines.applications.operational_space import OperationalSpace as OperationalSpace
     from mbkit.engines.applications.operational_space import operational_space as operational_space
     from mbkit.engines.applications.variants import variants as variants
-    from mbkit.engines.consistent.impacts import Impact as Impact
-    from mbkit.engines.consistent.impacts import impact as impact
     from mbkit.errors import MbkitError as MbkitError
     from mbkit.identify import excitation as excitation
     from mbkit.identify import identify as identify
@@ -66,7 +66,7 @@ if TYPE_CHECKING:
 #: Names by the modules that hold them.
 _NAMES = {
     "engines": "Dynamics dynamics engine",
-    "engines.consistent.impacts": "Impact impact",
+    "engines.applications.impacts": "Impact impact",
     "engines.applications.operational_space": "OperationalSpace operational_space",
     "engines.applications.variants": "variants",
     "errors": "MbkitError",
@@ -91,15 +91,15 @@ _MODULES = {name: f"mbkit.{name}" for name in _OWN.split()} | {"baseline": "mbki
 
 #: Modules that rooms below use.
 _HANDED_DOWN = {
-    "consistent_states": "mbkit.engines.consistent.random_states",
+    "consistent_states": "mbkit.engines.applications.random_states",
     "constraint_manifold": "mbkit.engines.constraint_manifold",
     "fixed_step": "mbkit.simulate.solvers.fixed_step",
     "formulas": "mbkit.lagrangian.formulas",
     "freeing": "mbkit.model.changes.freeing",
-    "step_in_phases": "mbkit.simulate.solvers.in_phases.single_step",
+    "step_in_phases": "mbkit.simulate.solvers.in_phases.runs",
     "locking": "mbkit.model.changes.locking",
     "sdf": "mbkit.engines.imported",
-    "segments": "mbkit.model.changes.segments",
+    "segments": "mbkit.model.changes.joining",
 }
 hand_down(_HANDED_DOWN)
 

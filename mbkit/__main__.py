@@ -1,6 +1,6 @@
 """The entry point of the command `mbkit` and of ``python -m mbkit``; it listens to Ctrl-C before other imports."""
 
-from mbkit import _interrupt
+from mbkit import _process as _interrupt
 
 
 def main() -> None:

@@ -11,8 +11,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbkit._warn import warn
-from mbkit.errors import InputError, MbkitWarning, UnsupportedError
+from mbkit.errors import InputError, MbkitWarning, UnsupportedError, warn
 
 Array = NDArray[np.float64]
 K = TypeVar("K")

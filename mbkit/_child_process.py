@@ -29,7 +29,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
 
-from mbkit import _interrupt
+from mbkit import _process as _interrupt
 from mbkit.errors import UnsupportedError
 
 OUT_OF_MEMORY: Final = "it took more memory than allowed"

@@ -1,11 +1,15 @@
 """The errors and warnings that mbkit raises, all in one place.
 
 Every message names the argument or the body, says what was expected and what came, and what to do next.
+
+Warnings that point at the user's line.
 """
 
 from __future__ import annotations
 
 import difflib
+import sys
+import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -251,3 +255,13 @@ class Suggestions:
 
 def _shortened(text: str, most: int = _MAX_CHARACTERS) -> str:
     return text if len(text) <= most else text[: most - 4] + " ..."
+
+
+def warn(message: str, category: type[Warning], unless: tuple[str, ...] = ()) -> None:
+    """Warn at the line that called the library, however deep in it this is, unless some of its modules are between."""
+    level, frame = 1, sys._getframe(0)
+    while frame.f_back is not None and (name := frame.f_globals.get("__name__", "")).split(".")[0] == "mbkit":
+        if name.startswith(unless):
+            return
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, category, stacklevel=level)

@@ -776,7 +776,7 @@ def more_inputs(x: Example) -> list[np.ndarray]:
 def derived(x: Example) -> Iterator[None]:
     """Let texts take the equations that the engine on an example has: it derives them as they do."""
     with ExitStack() as stack:
-        for module in ("codegen.c_source", "lagrangian.printing.program_text"):
+        for module in ("codegen.c_source", "lagrangian.program_text"):
             stack.enter_context(patch(f"mbkit.{module}.equations_of", lambda _: engine(x.name).equations))
         yield
 

@@ -35,7 +35,7 @@ from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.remote import environment
 from mbkit.engines.remote.packages import PACKAGES
 from mbkit.lagrangian import from_model
-from mbkit.lagrangian.printing.summary import SystemSummary, python_code
+from mbkit.lagrangian.summary import SystemSummary, python_code
 from mbkit.model import Model
 from mbkit.model.elements.kinds import PART_KINDS
 from mbkit.model.elements.paths import PATHS as GATES
@@ -46,11 +46,10 @@ from mbkit.studies.baseline.file import Rollout
 from mbkit.studies.compare import figure
 from mbkit.studies.compare.study import Judge
 from mbkit.studies.compare.terms import TERMS, states
-from mbkit.studies.importers.loops import Written, between_joints
-from mbkit.studies.importers.study import compared
+from mbkit.studies.importers.study import Written, between_joints, compared
 from mbkit.studies.measurement import Problem
 from mbkit.studies.stress.case import Case as StressCase
-from mbkit.studies.stress.measure import Limits, measure, prepare
+from mbkit.studies.stress.measurements import Limits, measure, prepare
 from mbkit.testing import assert_same_dynamics
 from tests import kind_examples
 from tests.fake_cuda import fake_gpu

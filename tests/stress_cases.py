@@ -11,7 +11,7 @@ import numpy as np
 import mbkit as mb
 from mbkit.errors import MbkitWarning, UnsupportedError
 from mbkit.studies.stress import Case, Problem
-from mbkit.studies.stress import measure as runs
+from mbkit.studies.stress import measurements as runs
 
 SIMULATE = runs.simulate
 

@@ -20,7 +20,7 @@ from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import Trajectory, at_section, simulate, stiffness
 from mbkit.simulate.solvers.auto import StepRateMonitor, _chosen
 from mbkit.simulate.solvers.trajectory_record import AcceptedSteps
-from mbkit.studies.motions.exact import cart_pole as light_cart_pole
+from mbkit.studies.exact_motions import cart_pole as light_cart_pole
 from mbkit.studies.stress import cases
 from tests.random_trees import SOUND, random_tree
 from validation import closed_forms

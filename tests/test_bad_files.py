@@ -19,8 +19,7 @@ from hypothesis import strategies as st
 from mbkit import errors
 from mbkit.errors import LoadError, MbkitError, ModelError, NonPhysicalWarning
 from mbkit.load import load, xml_reader
-from mbkit.load.added_loops import read_loops
-from mbkit.load.loader import find
+from mbkit.load.loader import find, read_loops
 from mbkit.load.urdf_reader import Snapper, read_links
 from tests.descriptions import INERTIAL, LIMIT, links, robot, written
 from tests.descriptions import urdf_joint as joint

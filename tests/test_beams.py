@@ -13,7 +13,7 @@ import mbkit as mb
 from mbkit.errors import InputError, ModelError, UnsupportedError
 from mbkit.methods import METHODS
 from mbkit.model.elements.beams import clamped_free
-from mbkit.simulate.plotting.stick_figure import skeleton
+from mbkit.simulate.plotting.motion_strip import skeleton
 from mbkit.testing import assert_engines_agree
 from validation import beams
 

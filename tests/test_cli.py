@@ -324,7 +324,7 @@ def test_a_result_that_cannot_be_written_is_still_printed(monkeypatch):
     def full(*_: object, **__: object) -> Path:
         raise OutputError("cannot write there: No space left on device")
 
-    monkeypatch.setattr("mbkit.report.output_folder.write", full)
+    monkeypatch.setattr("mbkit.report.terminal.write", full)
     for more in ((), ("--json",)):
         result = call("check", "pendulum", *QUICK, *more)
         assert result.exit_code == 2
@@ -452,7 +452,7 @@ def test_a_file_of_somebody_else_is_not_replaced(here, command):
 #: A command whose interruption is swallowed, as libraries do that it meets in their imports.
 _SWALLOWING = """
 import os, sys, time
-from mbkit import _interrupt
+from mbkit import _process as _interrupt
 import mbkit.cli
 @mbkit.cli.cli.command("wait")
 def wait():

@@ -28,7 +28,7 @@ from mbkit.engines.registry import find_engine
 from mbkit.errors import InputError, NumericalError, UnknownNameError
 from mbkit.studies.compare import beyond_terms
 from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
-from mbkit.studies.compare.beyond_terms import rollouts
+from mbkit.studies.compare.beyond_terms import findings, rollouts
 from mbkit.studies.compare.body_terms import BODY_TERMS
 from mbkit.studies.compare.errors import (
     Scales,
@@ -38,9 +38,7 @@ from mbkit.studies.compare.errors import (
     interleaved,
     matrix_errors,
 )
-from mbkit.studies.compare.findings import findings
-from mbkit.studies.compare.rows import RolloutRow
-from mbkit.studies.compare.terms import TERMS
+from mbkit.studies.compare.terms import TERMS, RolloutRow
 from mbkit.studies.compare.terms import states as study_states
 from mbkit.testing import assert_engines_agree
 from tests import kind_examples

@@ -26,10 +26,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mbkit as mb
-from mbkit import _fork
+from mbkit import _process as _interrupt
 from mbkit.codegen import backend, disk_cache, jit, simd_kernel
+from mbkit.codegen.backend import Machine
 from mbkit.codegen.compiled import Call, Compiled, KernelSequence, _runner, compiled
-from mbkit.codegen.interpreter import Machine
 from mbkit.codegen.program import Program, program
 from mbkit.codegen.python_call import python_call
 from mbkit.errors import InputError
@@ -554,7 +554,7 @@ def test_levels_that_are_none_are_refused(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_fork_waits_for_locks_that_a_thread_takes_in_any_order():
-    older, newer = (_fork.fork_safe(threading.RLock()) for _ in range(2))
+    older, newer = (_interrupt.fork_safe(threading.RLock()) for _ in range(2))
     done, begun = threading.Event(), threading.Event()
 
     def work():
@@ -570,8 +570,8 @@ def test_a_fork_waits_for_locks_that_a_thread_takes_in_any_order():
     def forks():
         begun.wait()
         for _ in range(10):
-            _fork._take()
-            _fork._release()
+            _interrupt._take()
+            _interrupt._release()
         done.set()
 
     threads = [threading.Thread(target=target, daemon=True) for target in (work, forks)]
@@ -585,7 +585,7 @@ def test_a_fork_gets_its_turn_between_threads_that_are_always_busy():
     done = threading.Event()
 
     def work():
-        own = _fork.fork_safe(threading.RLock())
+        own = _interrupt.fork_safe(threading.RLock())
         while not done.is_set():
             with own:
                 time.sleep(5e-3)
@@ -593,8 +593,8 @@ def test_a_fork_gets_its_turn_between_threads_that_are_always_busy():
 
     def forks():
         for _ in range(5):
-            _fork._take()
-            _fork._release()
+            _interrupt._take()
+            _interrupt._release()
         done.set()
 
     for target in (work, work, work, forks):

@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import null_space
 
 import mbkit as mb
-from mbkit.derivation.steps.constrained_midpoint import ConstrainedMidpoint
+from mbkit.derivation.steps.midpoint import ConstrainedMidpoint
 from tests.test_loop_dynamics import closed_tree
 
 EPS = float(np.finfo(float).eps)

@@ -16,7 +16,7 @@ import mbkit as mb
 from mbkit.errors import InputError, ModelError, UnsupportedError
 from mbkit.model import Coupler
 from mbkit.studies.baseline.description import changes, described
-from mbkit.studies.importers.loops import Written, between_joints, coupler_differences
+from mbkit.studies.importers.study import Written, between_joints, coupler_differences
 from tests.random_trees import IN_MUJOCO, coupled, off, random_tree
 from tests.scenes import chain
 from tests.test_loops_pinocchio import against_34_digits

@@ -16,8 +16,7 @@ from mbkit.cli import cli
 from mbkit.lagrangian import systems
 from mbkit.lagrangian.energies.symbols import velocity_of
 from mbkit.lagrangian.printer import ExpressionPrinter, folded, written
-from mbkit.lagrangian.printing.catalog_symbols import with_plain_turns
-from mbkit.lagrangian.printing.summary import SystemSummary, python_code
+from mbkit.lagrangian.summary import SystemSummary, python_code, with_plain_turns
 from mbkit.load.loader import find
 
 

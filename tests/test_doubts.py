@@ -13,12 +13,12 @@ import pytest
 import mbkit as mb
 from mbkit.errors import DoubtfulRunWarning
 from mbkit.methods.registry import Tolerances
-from mbkit.simulate.diagnostics.checks import lost, massless_joints
+from mbkit.simulate.checks import lost, massless_joints
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord
 from mbkit.simulate.torque import Torque
-from mbkit.studies.motions.exact import pendulum
+from mbkit.studies.exact_motions import pendulum
 from tests.scenes import METHODS, mounted
 
 # Drake's own runs have tests of their own.

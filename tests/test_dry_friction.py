@@ -16,7 +16,7 @@ from scipy.optimize import brentq, lsq_linear
 import mbkit as mb
 from mbkit.engines.elements.jumps import forces_at_rest
 from mbkit.errors import InputError, MbkitWarning, ModelError, TorqueError
-from mbkit.lagrangian.printing.summary import SystemSummary, python_code
+from mbkit.lagrangian.summary import SystemSummary, python_code
 from mbkit.model import Model
 from mbkit.model.changes.jumps import held_at_rest
 from tests.random_trees import IN_MUJOCO, SOUND, off, random_tree, states

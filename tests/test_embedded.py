@@ -22,7 +22,7 @@ from mbkit.model.integration_space import Space
 from mbkit.simulate import Event, Trajectory, at_section, simulate
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
-from mbkit.simulate.solvers.adaptive_compiled import CompiledAttempts
+from mbkit.simulate.solvers.adaptive import CompiledAttempts
 from mbkit.simulate.solvers.step_attempts import RungeKuttaAttempts
 from mbkit.simulate.solvers.trajectory_record import AcceptedSteps
 from mbkit.simulate.torque import Torque

@@ -13,7 +13,7 @@ import sympy as sp
 import mbkit as mb
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian.from_description import from_model
-from mbkit.lagrangian.printing.catalog_symbols import in_symbols, letters
+from mbkit.lagrangian.summary import in_symbols, letters
 from mbkit.lagrangian.system import QuasiLagrangian
 from mbkit.lagrangian.trig.shortest_form import number
 from mbkit.lagrangian.trig.simplify import forms, settled, tidy

@@ -19,9 +19,9 @@ import pytest
 from mbkit.catalog import double_pendulum
 from mbkit.codegen import extended_precision, simd_kernel, taylor
 from mbkit.codegen import program as program_module
+from mbkit.codegen.backend import Machine
 from mbkit.codegen.c_source import c_code
 from mbkit.codegen.extended_precision import Extended, arithmetic
-from mbkit.codegen.interpreter import Machine
 from mbkit.codegen.llvm_ir import CALLS
 from mbkit.codegen.program import program
 from mbkit.codegen.taylor import TaylorSystem, precision

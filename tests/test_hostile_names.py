@@ -24,7 +24,7 @@ from click.testing import CliRunner
 import mbkit as mb
 from mbkit import _escape
 from mbkit.cli import cli
-from mbkit.lagrangian.printing.summary import SystemSummary, python_code
+from mbkit.lagrangian.summary import SystemSummary, python_code
 from tests.scenes import mounted
 
 #: Code for every reader of an output, and what a terminal obeys. XML can hold the first of them.

@@ -12,7 +12,7 @@ from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
 
 import mbkit as mb
-from mbkit.engines.consistent.random_states import flowed, states_of
+from mbkit.engines.applications.random_states import flowed, states_of
 from mbkit.engines.constraint_manifold import manifold_of, refuse_unreachable
 from mbkit.errors import InputError, ModelError, UnsupportedError
 from mbkit.lagrangian import from_model, systems
@@ -537,7 +537,7 @@ def test_a_random_state_hangs_little_on_its_draw(monkeypatch) -> None:
         if (state := flowed(manifold, q, v, well)) is not None:
             taken.append((q, v, state[0]))
     assert len(taken) > 120
-    monkeypatch.setattr("mbkit.engines.consistent.random_states._SLOPE", np.inf)
+    monkeypatch.setattr("mbkit.engines.applications.random_states._SLOPE", np.inf)
     moved = [flowed(manifold, q + aside, v, 0.0)[0] - end for q, v, end in taken]
     assert np.linalg.norm(moved, axis=1).max() < 1e3 * np.linalg.norm(aside)
 

@@ -19,7 +19,7 @@ from validation import four_bar as bare
 
 pytest.importorskip("pydrake")
 
-from mbkit.engines.drake.rollout import DiscreteRun
+from mbkit.engines.drake.engine import DiscreteRun
 from tests.scenes import slider
 
 #: Kinds of loops that Drake has.

@@ -16,8 +16,8 @@ from mbkit.model import Loop
 from mbkit.studies.explain.hypotheses import moved
 from mbkit.studies.explain.merged_model import Tolerances
 from mbkit.studies.importers import study
-from mbkit.studies.importers.loops import Written, between_joints, coupler_differences, loop_differences
 from mbkit.studies.importers.result import ParserComparison, Stage
+from mbkit.studies.importers.study import Written, between_joints, coupler_differences, loop_differences
 
 BODY = '<inertial pos=".2 0 0" mass="1" diaginertia=".1 .1 .1"/>'
 #: Two links in a chain; {0} is where the second one's joint stands in it, {1} its attitude, {2} the equalities.

@@ -68,6 +68,6 @@ def test_rodas5_on_pinocchio_needs_no_derivation(monkeypatch):
     q, v = model.random_state(np.random.default_rng(0))
     derived = mb.simulate(mb.dynamics(model, "lagrangian"), q, v, 0.1, method="rodas5", rtol=1e-10)
     dyn = mb.dynamics(model, "pinocchio")
-    monkeypatch.setattr("mbkit.simulate.diagnostics.stiffness.dynamics", None)
+    monkeypatch.setattr("mbkit.simulate.stiffness_measure.dynamics", None)
     run = mb.simulate(dyn, q, v, 0.1, method="rodas5", rtol=1e-10)
     assert np.abs(model.difference(derived.q[-1], run.q[-1])).max() < 1e-8

@@ -8,7 +8,7 @@ import pytest
 
 import mbkit as mb
 from mbkit._child_process import end_all
-from mbkit.engines.remote import importer
+from mbkit.engines.remote import dynamics
 from mbkit.engines.remote.packages import PACKAGES, EngineVersion, Package, register_remote_engine
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.studies.explain.terms import TERMS
@@ -28,7 +28,7 @@ def test_an_importer_that_is_not_judged_is_refused_by_name(tmp_path: Path) -> No
         mb.compare_parsers(path, ["newtn"])
     with pytest.raises(InputError, match="mujoco-warp"):
         mb.compare_parsers(path, mb.engine("newton"))  # type: ignore[arg-type]
-    assert set(importer.importers()) == {"newton", "mujoco-warp", "mjx", "mjx-single"}
+    assert set(dynamics.importers()) == {"newton", "mujoco-warp", "mjx", "mjx-single"}
 
 
 def needs(name: str) -> None:

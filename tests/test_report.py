@@ -16,21 +16,19 @@ from mbkit._escape import one_line, terminal
 from mbkit.errors import OutputError
 from mbkit.report import page as pages
 from mbkit.report import terminal as tables
-from mbkit.report.output_folder import check_writable, file_stem, write
+from mbkit.report.terminal import check_writable, file_stem, write
 from mbkit.simulate.progress import Bar
 from mbkit.studies.compare import figure
 from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
 from mbkit.studies.compare.body_terms import BODY_TERMS, MECHANISM_TERMS
-from mbkit.studies.compare.result import Comparison
-from mbkit.studies.compare.rows import Finding, Omission, RolloutRow, Row
-from mbkit.studies.compare.tables import MEANINGS
-from mbkit.studies.compare.terms import CONSTRAINT_TERMS, TERMS
+from mbkit.studies.compare.result import MEANINGS, Comparison
+from mbkit.studies.compare.terms import CONSTRAINT_TERMS, TERMS, Finding, Omission, RolloutRow, Row
 from mbkit.studies.formatting import count_text, error_text, time_text
 from mbkit.studies.measurement import Measurement
 from mbkit.studies.results import Refusal
 from mbkit.studies.work_precision import result as curves
-from mbkit.studies.work_precision.curve import Curve
 from mbkit.studies.work_precision.result import WorkPrecision
+from mbkit.studies.work_precision.sweep import Curve
 
 NAN = math.nan
 HOSTILE = '<script>alert("x")</script>[red]x[/red]\x1b[31m\u202e$x$</style>'

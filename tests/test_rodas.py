@@ -20,7 +20,7 @@ from mbkit.model.integration_space import Space
 from mbkit.simulate import at_section, simulate
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
-from mbkit.simulate.solvers.adaptive_compiled import CompiledAttempts
+from mbkit.simulate.solvers.adaptive import CompiledAttempts
 from mbkit.simulate.solvers.step_attempts import RosenbrockAttempts
 from mbkit.simulate.solvers.trajectory_record import AcceptedSteps
 from mbkit.simulate.torque import Torque

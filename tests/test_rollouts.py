@@ -11,7 +11,7 @@ import pytest
 
 from mbkit import catalog
 from mbkit.codegen import compiled_calls
-from mbkit.codegen.interpreter import Machine
+from mbkit.codegen.backend import Machine
 from mbkit.derivation import Equations
 from mbkit.derivation.steps import fixed
 from mbkit.derivation.steps.collocation import Collocation
@@ -27,8 +27,8 @@ from mbkit.simulate import RK4, Trajectory, simulate
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.solvers import compiled_fixed_step
+from mbkit.simulate.solvers import machine_code_blocks as blocks
 from mbkit.simulate.solvers.implicit_midpoint import midpoint_of
-from mbkit.simulate.solvers.machine_code import implicit_steps
 from mbkit.simulate.time_grid import Grid
 from mbkit.simulate.torque import Torque
 from tests.random_trees import ALL, random_tree
@@ -290,7 +290,7 @@ def test_a_block_of_implicit_steps_stops_anywhere(method: str, planar: Lagrangia
     parts = Collocation(planar.equations, formula) if isinstance(formula, ImplicitTableau) else midpoint_of(planar)
     momenta = np.einsum("nkij,nkj->nki", [planar.mass_matrix(x) for x in run.q], run.v)
     carried = {"q": run.q, "w": run.v, "pi": momenta}
-    chunk = implicit_steps.ImplicitChunk(planar, parts, 3, steps, torques=False)
+    chunk = blocks.ImplicitChunk(planar, parts, 3, steps, torques=False)
     chunk.begin(q, carried[chunk.carried[1]][:, 0], np.zeros((3, parts.unknowns)), np.empty(0))
     chunk.set_times(Grid.of(0.0, 1.0, 1e-3), 0, steps)
     j = 0

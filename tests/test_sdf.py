@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import mbkit as mb
 from mbkit.errors import LoadError, MbkitError
-from mbkit.studies.compare.findings import findings
+from mbkit.studies.compare.beyond_terms import findings
 
 CLOSE = 1e-12
 drake = pytest.mark.skipif(find_spec("pydrake") is None, reason="Drake is not installed")

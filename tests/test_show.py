@@ -22,10 +22,9 @@ from PIL import Image
 import mbkit as mb
 from mbkit.errors import InputError, MbkitWarning, OutputError, UnsupportedError
 from mbkit.load import shapes as solids
-from mbkit.model.poses import body_poses
+from mbkit.model.description import body_poses
 from mbkit.show import Scene, mesh_files, shapes_of, view
-from mbkit.show.mesh_files import _by_coal, read_surfaces
-from mbkit.show.surfaces import solid, thinned
+from mbkit.show.mesh_files import _by_coal, read_surfaces, solid, thinned
 from tests.random_trees import IN_MUJOCO, random_tree
 
 EPS = np.finfo(float).eps

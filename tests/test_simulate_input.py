@@ -455,7 +455,7 @@ def test_a_run_away_is_not_blamed_on_the_torque(method: str) -> None:
 
 _NATIVE = """
 import sys
-import mbkit as mb, mbkit.engines.drake.rollout as rollout
+import mbkit as mb, mbkit.engines.drake.engine as rollout
 # With steps as long as these Drake does not come back.
 rollout.SimulatorConfig = lambda config=rollout.SimulatorConfig, **given: config(max_step_size=1e9, **given)
 over = rollout.DrakeRun.over

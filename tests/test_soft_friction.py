@@ -17,8 +17,8 @@ from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 from mbkit.identify import filtered_motion
 from mbkit.model import Model
-from mbkit.studies.compare.rows import OWN_LAW
-from mbkit.studies.motions.reference import reference
+from mbkit.studies.compare.terms import OWN_LAW
+from mbkit.studies.reference_motions import reference
 from tests.random_trees import IN_MUJOCO, random_tree
 
 

@@ -15,8 +15,8 @@ from mbkit.engines import dynamics
 from mbkit.errors import MbkitWarning
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import simulate
-from mbkit.simulate.diagnostics.stiffness import RateJacobian
 from mbkit.simulate.solvers.vector_field import Rates
+from mbkit.simulate.stiffness_measure import RateJacobian
 from tests.random_trees import ALL, random_tree
 from tests.scenes import slider
 from validation import closed_forms

@@ -26,9 +26,10 @@ from mbkit._child_process import WorkerDiedError, WorkerTimeoutError
 from mbkit.cli import cli
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.studies import InterruptedSweepError, StressResult
+from mbkit.studies._checkpoint import OUT_OF_TIME
 from mbkit.studies.stress import Case, CaseResult, Measurement, Problem, Row, stress
 from mbkit.studies.stress.case import problem_of
-from mbkit.studies.stress.measure import (
+from mbkit.studies.stress.measurements import (
     Limits,
     Prepared,
     condition,
@@ -37,7 +38,6 @@ from mbkit.studies.stress.measure import (
     reference_motion,
 )
 from mbkit.studies.stress.study import CaseSweep
-from mbkit.studies.study_runs import OUT_OF_TIME
 from tests import stress_cases as own
 
 METHODS = ("rk4", *own.ENDS)
@@ -365,7 +365,7 @@ def test_two_runs_that_agree_are_a_truth_and_where_none_do_there_is_none(monkeyp
     assert np.abs(truth.q - other.q).max() < 1e-12
     # 1e5 swings cannot be followed in the time, and series would take longer to compile than is left.
     series = []
-    search = import_module("mbkit.studies.motions.reference")
+    search = import_module("mbkit.studies.reference_motions")
     monkeypatch.setattr(search, "taylor_pair", lambda *x: series.append(x))
     truth, told = reference_motion(own.sprung(1e12), times, 1e-7, 0.5)
     assert truth is None

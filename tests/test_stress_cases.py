@@ -15,14 +15,14 @@ from mbkit.engines.base import at_times
 from mbkit.errors import UnknownNameError
 from mbkit.model.validation import sample_mass_matrix
 from mbkit.simulate import simulate
-from mbkit.studies.motions import exact as exact_motions
-from mbkit.studies.motions.exact import cart_pole, pendulum, precession
-from mbkit.studies.motions.reference import gap
+from mbkit.studies import exact_motions as exact_motions
+from mbkit.studies.exact_motions import cart_pole, pendulum, precession
+from mbkit.studies.reference_motions import gap
 from mbkit.studies.stress import cases
 from mbkit.studies.stress.case import Case, problem_of, times_of
 from mbkit.studies.stress.cases.rigid import box_spin, straight_inertia
 from mbkit.studies.stress.cases.springs import largest_step, stable_steps
-from mbkit.studies.stress.measure import Limits, measure, prepare
+from mbkit.studies.stress.measurements import Limits, measure, prepare
 from validation import closed_forms, elliptic
 
 ALL = tuple(cases.CASES.values())

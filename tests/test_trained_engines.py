@@ -25,7 +25,7 @@ from mbkit.errors import EngineProcessError, InputError, UnknownNameError, Unsup
 from mbkit.studies._targets import engine_names
 from mbkit.studies.compare.errors import digits_of, epsilon
 from mbkit.studies.measurement import Measurement
-from mbkit.studies.work_precision.curve import Curve
+from mbkit.studies.work_precision.sweep import Curve
 from tests.random_trees import random_tree
 from tests.test_engine_versions import environments, installer, present  # noqa: F401  # fixtures
 

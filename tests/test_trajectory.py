@@ -18,7 +18,7 @@ from mbkit.engines import dynamics
 from mbkit.errors import InputError, LoadError, MbkitWarning, OutputError, TorqueError, UnsupportedError
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import METHODS, Trajectory, at_section, simulate
-from mbkit.simulate.plotting.stick_figure import skeleton
+from mbkit.simulate.plotting.motion_strip import skeleton
 from mbkit.simulate.run_data import _by_cubics
 from tests.random_trees import off, random_tree, rotation, states
 

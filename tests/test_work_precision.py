@@ -28,9 +28,16 @@ from mbkit.errors import InputError, MbkitWarning, UnknownNameError
 from mbkit.simulate import METHODS
 from mbkit.studies import InterruptedSweepError, Reference, work_precision
 from mbkit.studies.measurement import Measurement
-from mbkit.studies.work_precision.curve import Curve, gains_nothing, observed_order
 from mbkit.studies.work_precision.result import WorkPrecision
-from mbkit.studies.work_precision.sweep import CurveMeasurement, _without_heyoka_cache, plans, repetitions
+from mbkit.studies.work_precision.sweep import (
+    Curve,
+    CurveMeasurement,
+    _without_heyoka_cache,
+    gains_nothing,
+    observed_order,
+    plans,
+    repetitions,
+)
 from tests.scenes import chain, hinge, slider
 
 FIXED = [m.name for m in METHODS.values() if m.kind != "adaptive"]

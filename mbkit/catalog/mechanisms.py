@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from mbkit.catalog._links import TURN, X, Z
-from mbkit.catalog._system import Vector, down, moments, nonnegative, system
+from mbkit.catalog._system import TURN, Vector, X, Z, down, moments, nonnegative, system
 from mbkit.model import Model, ModelBuilder, Number, known, nominal
 
 __all__ = [

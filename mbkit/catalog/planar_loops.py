@@ -9,8 +9,22 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from mbkit.catalog._links import ORIGIN, THIRDS, TURN, Pair, X, Z, add_link, add_pin, add_rod, at, times, triangle
-from mbkit.catalog._system import down, system
+from mbkit.catalog._system import (
+    ORIGIN,
+    THIRDS,
+    TURN,
+    Pair,
+    X,
+    Z,
+    add_link,
+    add_pin,
+    add_rod,
+    at,
+    down,
+    system,
+    times,
+    triangle,
+)
 from mbkit.model import Model, ModelBuilder, Number
 
 __all__ = [

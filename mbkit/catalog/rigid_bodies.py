@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, finite_array, shown
-from mbkit.catalog._links import X, Y, Z
-from mbkit.catalog._system import Vector, down, lengths, moments, nonnegative, point, system
+from mbkit.catalog._system import Vector, X, Y, Z, down, lengths, moments, nonnegative, point, system
 from mbkit.errors import InputError
 from mbkit.model import Model, ModelBuilder, Number
 

@@ -8,8 +8,7 @@ from __future__ import annotations
 from math import cos, pi, sin
 from typing import Final
 
-from mbkit.catalog._links import X, Y, Z
-from mbkit.catalog._system import Vector, acute, down, finite, nonnegative, point, system
+from mbkit.catalog._system import Vector, X, Y, Z, acute, down, finite, nonnegative, point, system
 from mbkit.model import Model, ModelBuilder, Number
 
 __all__ = ["bicycle", "chaplygin_sleigh", "rolling_disc"]

@@ -10,8 +10,24 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit.catalog._links import THIRDS, TURN, Point, X, Y, Z, add_pin, add_rod, at, leg, times
-from mbkit.catalog._system import acute, down, nonnegative, number, system
+from mbkit.catalog._system import (
+    THIRDS,
+    TURN,
+    Point,
+    X,
+    Y,
+    Z,
+    acute,
+    add_pin,
+    add_rod,
+    at,
+    down,
+    leg,
+    nonnegative,
+    number,
+    system,
+    times,
+)
 from mbkit.model import Model, ModelBuilder, Number
 
 __all__ = ["bricard", "delta_robot", "double_cardan_shaft", "flyball_governor", "stewart_platform"]

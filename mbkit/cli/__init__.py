@@ -13,7 +13,7 @@ import sys
 import click
 
 from mbkit._version import __version__
-from mbkit.cli import baseline, bench, check, convert, derive, diff, lint, plot, simulate, stress
+from mbkit.cli import baseline, bench, check, derive, diff, simulate
 from mbkit.cli._shared import CommandGroup
 
 
@@ -33,8 +33,17 @@ def cli() -> None:
 
 
 for _command in (
-    *(check.check, lint.lint, diff.diff, baseline.baseline, derive.derive, derive.export, simulate.simulate, plot.plot),
-    *(bench.bench, stress.stress, convert.convert, convert.robots),
+    *(
+        check.check,
+        check.lint,
+        diff.diff,
+        baseline.baseline,
+        derive.derive,
+        derive.export,
+        simulate.simulate,
+        simulate.plot,
+    ),
+    *(bench.bench, bench.stress, diff.convert, diff.robots),
 ):
     cli.add_command(_command)
 

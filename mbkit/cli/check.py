@@ -1,4 +1,7 @@
-"""`mbkit check`: do the engines agree on a model."""
+"""`mbkit check`: do the engines agree on a model.
+
+`mbkit lint`: is the file itself plausible.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from mbkit import _interrupt
+from mbkit import _process as _interrupt
 from mbkit.cli import _shared as shared
 from mbkit.cli._shared import AGREE, DIFFER, INTERRUPTED, MISUSE, Report
 from mbkit.errors import MbkitError
@@ -170,3 +173,28 @@ def _check_all(report: Report, jobs: int | None, settings: dict[str, Any]) -> No
     if interrupted:
         shared.say("interrupted", f"{len(outcomes)} of {expected} robots were finished")
     shared.leave(INTERRUPTED if interrupted else MISUSE if not written else AGREE if result.passed else DIFFER)
+
+
+@shared.command("mbkit lint arm.urdf", "mbkit lint panda --control-period 0.004")
+@click.argument("target")
+@click.option(
+    "--control-period",
+    default=1e-3,
+    show_default=True,
+    type=click.FloatRange(min=0, min_open=True),
+    help="Period of the controller or step, s.",
+)
+@click.option("--no-shapes", is_flag=True, help="Leave the shapes and meshes of the file unread.")
+@shared.load_options
+@shared.json_option
+def lint(target: str, control_period: float, no_shapes: bool, options: dict[str, Any], as_json: bool) -> None:
+    """Say what is not plausible in TARGET, by what it knows of itself: units, frames, signs, placeholders, limits.
+
+    TARGET is what `mbkit check` takes. Links that no matter has are judged, not refused. Status 1 says that something
+    is wrong for sure or likely; what to look at leaves it 0.
+    """
+    from mbkit.studies.lint import lint as study
+
+    result = study(target, control_period=control_period, shapes=not no_shapes, **options)
+    shared.show(result.document(full=False), as_json=as_json)
+    shared.leave(shared.AGREE if result.passed else shared.DIFFER)

@@ -73,15 +73,15 @@ def derive(
         raise click.UsageError("--json and --program exclude each other; --program has --python, --latex and --c")
     if as_json and form:
         raise click.UsageError(f"--json and --{form} exclude each other: the JSON holds the equations in both forms")
-    from mbkit.report.output_folder import check_writable, write
+    from mbkit.report.terminal import check_writable, write
 
     if out is not None:
         check_writable(out)
     target = _model(system, options)
-    from mbkit.lagrangian.energies.charts import chart_names
+    from mbkit.lagrangian.energies.symbols import chart_names
     from mbkit.lagrangian.energy_model import EnergyModel
     from mbkit.lagrangian.from_description import from_model
-    from mbkit.lagrangian.printing.catalog_symbols import in_symbols, letters
+    from mbkit.lagrangian.summary import in_symbols, letters
     from mbkit.model.changes.jumps import held_at_rest
     from mbkit.simulate.progress import Bar
 
@@ -153,7 +153,7 @@ def _about(system: Callable[..., Lagrangian]) -> str:
 
 def _to_read(model: Model, snap: float, what: str) -> Model:
     """Return a model whose rotations near to plain ones are plain, and say so."""
-    from mbkit.lagrangian.printing.catalog_symbols import with_plain_turns
+    from mbkit.lagrangian.summary import with_plain_turns
 
     model, note = with_plain_turns(model, snap)
     if note:
@@ -163,7 +163,7 @@ def _to_read(model: Model, snap: float, what: str) -> Model:
 
 def _program(model: Model, quantity: str, form: str | None, snap: float) -> tuple[str, str]:
     """Return one quantity as named terms, and the ending of its file."""
-    from mbkit.lagrangian.printing.program_text import ProgramText, program
+    from mbkit.lagrangian.program_text import ProgramText, program
 
     if form in (None, "latex"):
         model = _to_read(model, snap, "terms")
@@ -181,11 +181,11 @@ def _text(
     lag: Lagrangian, names: dict[str, str], form: str | None, as_json: bool, bar: Any, note: str
 ) -> tuple[str, str]:
     if form == "python":
-        from mbkit.lagrangian.printing.summary import python_code
+        from mbkit.lagrangian.summary import python_code
 
         bar(0.1, "equations")
         return python_code(lag, note).rstrip("\n"), ".py"
-    from mbkit.lagrangian.printing.summary import SystemSummary
+    from mbkit.lagrangian.summary import SystemSummary
 
     summary = SystemSummary(lag, names=names, progress=lambda x, text: bar(0.1 + 0.9 * x, text), note=note)
     if as_json:

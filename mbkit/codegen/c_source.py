@@ -15,7 +15,7 @@ from typing import Final
 
 import casadi as ca
 
-from mbkit import _interrupt
+from mbkit import _process as _interrupt
 from mbkit._check import ALIGNED, CLASSICAL, axes_named
 from mbkit._escape import c_comment
 from mbkit._version import __version__

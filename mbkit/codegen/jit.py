@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 import llvmlite
 from llvmlite import binding as llvm
 
-from mbkit._fork import fork_safe
+from mbkit._process import fork_safe
 from mbkit.codegen import disk_cache as disk
 from mbkit.codegen.batch_loop import MAX_ARRAYS, RUN, batch_code
 from mbkit.codegen.program import Program

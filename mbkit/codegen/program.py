@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from mbkit.derivation.elements.arithmetic import BINARY, UNARY
+from mbkit.derivation.forces import BINARY, UNARY
 from mbkit.errors import UnsupportedError
 
 #: CasADi's codes -> our names, of the operations that every backend knows.

@@ -23,13 +23,13 @@ import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
-from mbkit._fork import fork_safe
+from mbkit._process import fork_safe
 from mbkit.codegen.program import Operation, Program, program
 from mbkit.derivation.equations import Equations, kept
 from mbkit.derivation.mass_matrix_solve import elimination_size
 from mbkit.errors import UnsupportedError
 from mbkit.model.elements.formula import completed
-from mbkit.model.rolling import discs_of
+from mbkit.model.loops import discs_of
 
 # A compiler's time for more is no longer spent unasked: 34,000 operations take 9 s.
 _MAX_TAYLOR_OPERATIONS: Final = 100_000

@@ -31,7 +31,7 @@ from mbkit._attributes import forwarded
 from mbkit._check import TYPED, Array
 from mbkit._reproducible import DEPENDENT, independent_rows
 from mbkit.derivation.body_motion import BodyMotion
-from mbkit.derivation.elements.arithmetic import casadi_arithmetic
+from mbkit.derivation.forces import casadi_arithmetic
 from mbkit.derivation.kinematics import Kinematics, Vector, add, column, constant_transposed_times, follower
 from mbkit.derivation.link_mechanics import LinkMechanics, Motion
 from mbkit.derivation.mass_matrix_solve import ConstraintFactors, ConstraintTerms, Factors, OrthogonalColumns
@@ -40,11 +40,10 @@ from mbkit.model import Model, NoSlip
 from mbkit.model.elements.motion_laws import MOTION_LAWS
 from mbkit.model.elements.references import called
 from mbkit.model.joint_types import cross3, dot3
-from mbkit.model.loops import LOOP_ROWS, LoopEnds
+from mbkit.model.loops import LOOP_ROWS, NO_SLIP_ROWS, Contact, LoopEnds, contact, discs_of
 from mbkit.model.manifold import closest_configuration, integrate, random_state
 from mbkit.model.parts import RESTING, Coupler, Loop
 from mbkit.model.quantities import of_groups
-from mbkit.model.rolling import NO_SLIP_ROWS, Contact, contact, discs_of
 from mbkit.model.validation import sample_mass_matrix
 
 #: Of the accelerations along a redundant row: what a stage of a long step leaves on its branch, and no other

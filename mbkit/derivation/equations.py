@@ -23,8 +23,8 @@ import numpy as np
 from mbkit.derivation import kinematics as energies
 from mbkit.derivation.body_motion import BODY_QUANTITIES, OF_FRAME, OF_WHOLE, BodyMotion
 from mbkit.derivation.constraints import CONSTRAINT_FUNCTIONS, ConstrainedMotion
-from mbkit.derivation.elements.forces import ElementForces
 from mbkit.derivation.fingerprint import SOURCES as _SOURCES  # noqa: F401  # read with the code that it fingerprints
+from mbkit.derivation.forces import ElementForces
 from mbkit.derivation.kinematics import Kinematics
 from mbkit.derivation.least_constraint import LeastConstraint, squares
 from mbkit.derivation.mass_matrix_solve import elimination_order, solve

@@ -17,8 +17,8 @@ from mbkit._check import Array
 from mbkit.errors import InputError
 from mbkit.model import Coupler, Model, NoSlip
 from mbkit.model.elements.references import KINDS_OF_PARTS
+from mbkit.model.loops import tangents
 from mbkit.model.parts import numbers
-from mbkit.model.rolling import tangents
 
 # CasADi's operators first search a conversion of their operands, some 15 µs each; `SX.binary` takes 2, and 4 with a
 # float, which it converts each time. A tree's kinematics are tens of thousands of them. This module replaces CasADi in

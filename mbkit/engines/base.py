@@ -17,13 +17,13 @@ from numpy.typing import ArrayLike
 
 from mbkit._attributes import ReadOnly, single_values
 from mbkit._check import Array, all_finite, batch_of, rows
-from mbkit._fork import fork_safe
+from mbkit._process import fork_safe
 from mbkit.engines import constrained, loads
 from mbkit.engines.closed_loops.actuation import ACTUATOR_FORCES
 from mbkit.engines.closed_loops.loop_loads import LOOP_LOADS
 from mbkit.engines.closed_loops.reduced_inertia import REDUCED_INERTIA, IndependentMotion
-from mbkit.engines.elements.added_force import UNDER_FORCE
 from mbkit.engines.elements.jumps import Jumps
+from mbkit.engines.elements.passive import UNDER_FORCE
 from mbkit.engines.frames_and_momenta import (
     ALIGNED,
     JOINT,
@@ -46,9 +46,9 @@ from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Frame, Joint, Model
 from mbkit.model.elements.kinds import EFFECTS, that_do
 from mbkit.model.elements.paths import Path
+from mbkit.model.loops import discs_of
 from mbkit.model.quantities import OF_BODIES
 from mbkit.model.quantities import QUANTITIES as TABLE
-from mbkit.model.rolling import discs_of
 from mbkit.model.validation import listing
 
 if TYPE_CHECKING:

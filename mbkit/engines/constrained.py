@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike
 from mbkit._check import CONSISTENT, ROUNDING, Array, batch_of
 from mbkit._imports import from_above
 from mbkit._reproducible import dependent, unit_rows
-from mbkit._warn import warn
 from mbkit.engines.evaluation import Evaluation
-from mbkit.errors import InputError, MbkitWarning, NumericalError
+from mbkit.errors import InputError, MbkitWarning, NumericalError, warn
 from mbkit.model.elements.paths import ALL, Path
 
 #: Words of each error of such a pose: no shorter step helps there.

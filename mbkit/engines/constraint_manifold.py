@@ -25,8 +25,8 @@ from mbkit.engines.constrained import ROWS, singular_pose
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Model
+from mbkit.model.loops import discs_of
 from mbkit.model.manifold import closest_configuration, least_change
-from mbkit.model.rolling import discs_of
 
 #: Rounds of the projection's iterations.
 _ROUNDS: Final = 8

@@ -25,7 +25,7 @@ from mbkit._check import axes_named as axes_named
 from mbkit.engines.evaluation import Evaluation
 from mbkit.errors import InputError
 from mbkit.model import Body, Frame, Model
-from mbkit.model.poses import frame_of
+from mbkit.model.description import frame_of
 from mbkit.model.quantities import QUANTITIES, of_groups
 from mbkit.spatial import skew
 

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from mbkit._warn import warn
-from mbkit.errors import KnownDefectWarning
+from mbkit.errors import KnownDefectWarning, warn
 
 # Engine, the first and the last version in which it was reproduced, quantity; the wrong value; the right one. The
 # first is the oldest that was tried, or the one that brought what is wrong: Pinocchio's wheels have an armature since

@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, count, finite_array, is_on_device, on_host, real
-from mbkit.codegen.backend import DERIVING, compile_by_default, executable, has_compiler
-from mbkit.codegen.interpreter import Machine
+from mbkit.codegen.backend import DERIVING, Machine, compile_by_default, executable, has_compiler
 from mbkit.derivation import ELIMINATIONS, Elimination, Equations, elimination_of, equations_of
 from mbkit.derivation.body_motion import BODY_QUANTITIES
 from mbkit.derivation.least_constraint import has_squares
 from mbkit.engines.base import Dynamics
 from mbkit.engines.derived import Derived, function_of, names_of
-from mbkit.engines.elements.added_force import UNDER_FORCE
+from mbkit.engines.elements.passive import UNDER_FORCE
 from mbkit.engines.frames_and_momenta import ALIGNED
 from mbkit.engines.loads import Wrenches
 from mbkit.engines.steps import momentum_step_slopes

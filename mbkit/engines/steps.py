@@ -29,7 +29,7 @@ from mbkit.model.integration_space import Space
 from mbkit.model.manifold import tangent_maps
 
 if TYPE_CHECKING:
-    from mbkit.codegen.interpreter import Machine
+    from mbkit.codegen.backend import Machine
 
 STEP_DERIVATIVE: Final = Path(
     "derivative of a step",
@@ -241,7 +241,7 @@ class DualSpace(Space):
     def _at(self, name: str, *given: Dual) -> Dual:
         if name not in self._machines:
             # CasADi is loaded where rotations are differentiated.
-            from mbkit.codegen.interpreter import Machine
+            from mbkit.codegen.backend import Machine
             from mbkit.derivation.steps.symbols import space_derivative
 
             sizes = [x.value.shape[-1] for x in given]

@@ -2,7 +2,7 @@
 
 from mbkit._imports import make_callable
 from mbkit.identify.fourier_series import Excitation, excitation
-from mbkit.identify.motion_noise import FilteredMotion, filtered_motion
+from mbkit.identify.measurements import FilteredMotion, filtered_motion
 from mbkit.identify.result import Identification, IdentifiedParameter, Residual, Undetermined
 from mbkit.identify.study import identify
 

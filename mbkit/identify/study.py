@@ -1,29 +1,293 @@
-"""`identify`: inertial parameters, friction and armature from measured motions and torques."""
+"""`identify`: inertial parameters, friction and armature from measured motions and torques.
+
+Weighted least squares of triangular systems: estimates, standard deviations, and what the data cannot tell.
+
+Noise of every velocity's torque has a variance of its own, taken from its residuals and used as weight, until both
+agree (Gautier and Poignet 2001, Extended Kalman filtering and weighted least squares dynamic identification of robot;
+Swevers et al. 1997, Optimal robot excitation and identification). Columns are scaled to equal length before the
+singular value decomposition, so that its small values are directions that the data cannot tell, and no matter of units.
+
+Physically consistent parameters: those of matter, nearest to the data and to prior knowledge.
+
+A body's ten parameters belong to some distribution of mass if and only if its pseudo-inertia J is positive definite
+(Wensing, Kim and Slotine 2018, Linear matrix inequalities for physically consistent inertial parameter
+identification; Traversaro et al. 2016, Identification of fully physical consistent inertial parameters using
+optimization on manifolds). With J = L X Lᵀ and L Lᵀ the pseudo-inertia before, X = 1 is no change, whatever units
+and axes. The prior is D(X), of one body ::
+
+    entropic   tr X - log det X - 4      (Lee, Wensing and Park 2020, Geometric robot dynamic identification)
+    euclidean  ½ ‖X - 1‖²
+
+and ½ Σ (residual/noise)² + weight · Σ D(X) is least. So with weight 1 a body may well be half or twice as heavy as
+before where the data says little, and what the data says is hardly moved.
+"""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import PRINTED, Array, real, shown
-from mbkit._warn import warn
+from mbkit._check import EPS, PRINTED, Array, real, shown
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import InputError, MbkitWarning
-from mbkit.identify.consistency import ENTROPIC, PRIORS, consistent, nearest
-from mbkit.identify.least_squares import Fit, fit, stacked
-from mbkit.identify.measurements import REST_SPEED_RATIO, Equations, Measurements, Unknowns, equations
-from mbkit.identify.motion_noise import bias, motion_noise
+from mbkit.errors import InputError, MbkitWarning, NumericalError, UnsupportedError, warn
+from mbkit.identify.measurements import (
+    REST_SPEED_RATIO,
+    Equations,
+    Measurements,
+    Unknowns,
+    bias,
+    equations,
+    motion_noise,
+)
 from mbkit.identify.result import SIGNIFICANT_DEVIATIONS, Identification, IdentifiedParameter, Residual, Undetermined
 from mbkit.model import Model
-from mbkit.model.base_parameters import BASE_PARAMETERS, POWERS, length_of, standard_names
+from mbkit.model.base_parameters import (
+    BASE_PARAMETERS,
+    POWERS,
+    STANDARD,
+    BaseParameters,
+    eliminated,
+    length_of,
+    parameters_of,
+    pseudo_inertia,
+    standard_names,
+)
 from mbkit.model.builder import expect_model
 from mbkit.model.changes.jumps import JumpLaw
 from mbkit.model.elements.forces import GravityCompensation
 from mbkit.simulate.progress import Progress, ProgressFunction
+
+ENTROPIC, EUCLIDEAN = "entropic", "euclidean"
+PRIORS: Final = (ENTROPIC, EUCLIDEAN)
+_SIZE: Final = len(STANDARD)
+
+
+def consistent(system: Array, unknowns: Unknowns, length: float, prior: str, weight: float) -> tuple[Array, Array]:
+    """Return the unknowns, (p,), and the standard parameters of all bodies, (10 nb,), that are matter.
+
+    Bodies without mass stay without. Numbers of joints are not negative.
+
+    Parameters
+    ----------
+    system : (m, p + 1) array
+        The equations, each over its noise.
+    unknowns : Unknowns
+    length : float
+        m, of the mechanism.
+    prior : {"entropic", "euclidean"}
+    weight : float
+
+    Raises
+    ------
+    UnsupportedError
+        Without the solver.
+    NumericalError
+        The solver found nothing.
+    """
+    cp = _solver()
+    base, p = unknowns.base, len(unknowns.names)
+    A, b = system[:, :p], system[:, p]
+    inertial = A[:, : base.count] @ base.matrix
+    loss: Any = cp.Variable(p - base.count, nonneg=True)
+    predicted: Any = A[:, base.count :] @ loss if p > base.count else 0.0
+    columns = _columns(base, length)
+    shapes: dict[int, Any] = {k: cp.Variable((4, 4), symmetric=True) for k in columns}
+    total: Any = 0.0
+    for k, X in shapes.items():
+        predicted = predicted + inertial[:, _SIZE * k : _SIZE * (k + 1)] @ columns[k] @ cp.vec(X, order="C")
+        total += cp.trace(X) - cp.log_det(X) if prior == ENTROPIC else 0.5 * cp.sum_squares(X - np.eye(4))
+    # The solver likes numbers of the order of one.
+    objective = (0.5 * cp.sum_squares(predicted - b) + weight * total) / (len(b) + weight)
+    # Written numbers are matter after rounding too.
+    problem = cp.Problem(cp.Minimize(objective), [X >> PRINTED * np.eye(4) for X in shapes.values()])
+    with warnings.catch_warnings():
+        # Its accuracy has fewer digits than it aims at, which data without noise do not allow.
+        warnings.filterwarnings("ignore", "Solution may be inaccurate")
+        try:
+            problem.solve(solver=cp.CLARABEL)
+            status = str(problem.status)
+        except cp.SolverError as error:
+            status = str(error)
+    if any(X.value is None for X in shapes.values()) or status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
+        raise NumericalError(
+            f"identify: Clarabel found no physically consistent parameters ({status}); "
+            "look for torques or weights of very different sizes, or take another prior_weight"
+        )
+    standard = base.standard.copy()
+    for k, X in shapes.items():
+        standard[_SIZE * k : _SIZE * (k + 1)] = columns[k] @ X.value.ravel()
+    rest = np.zeros(0) if p == base.count else np.maximum(loss.value, 0.0)
+    return np.concatenate([base.matrix @ standard, rest]), standard
+
+
+def _solver() -> Any:
+    try:
+        import clarabel  # noqa: F401  # the solver behind cvxpy
+        import cvxpy
+    except ModuleNotFoundError as error:
+        raise UnsupportedError(
+            f"identify: physical=True needs {error.name}, which is not installed; pip install 'mbkit[identify]'"
+        ) from None
+    return cvxpy
+
+
+def nearest(base: BaseParameters, values: Array, length: float) -> Array:
+    """Return the standard parameters with these base parameters that are nearest to the model's, (10 nb,).
+
+    Their distance is Σ ‖X - 1‖², over the bodies with mass; others stay.
+    """
+    columns = _columns(base, length)
+    together = np.zeros((base.standard.size, 16 * len(columns)))
+    for i, (k, own) in enumerate(columns.items()):
+        together[_SIZE * k : _SIZE * (k + 1), 16 * i : 16 * (i + 1)] = own
+    off = values[: base.count] - base.values
+    return np.asarray(base.standard + together @ np.linalg.lstsq(base.matrix @ together, off, rcond=None)[0])
+
+
+def _columns(base: BaseParameters, length: float) -> dict[int, Array]:
+    """Return, of each body with mass, the ten parameters of units of the entries of X, (10, 16)."""
+    out = {}
+    for k, J in enumerate(pseudo_inertia(base.standard.reshape(-1, _SIZE))):
+        if J.any():
+            L = _root(J, length)
+            out[k] = parameters_of(np.einsum("ia,jb->abij", L, L).reshape(16, 4, 4)).T
+    return out
+
+
+def _root(J: Array, length: float) -> Array:
+    """Return L with L Lᵀ = J, of a body without extent with a little of it."""
+    lengths = np.array([length, length, length, 1.0])
+    values, axes = np.linalg.eigh(J / np.outer(lengths, lengths))
+    values = np.maximum(values, PRINTED * values.max())
+    return np.asarray(lengths[:, None] * axes * np.sqrt(values))
+
+
+#: Singular values below this part of the largest one are directions that the data cannot tell. The rest of
+#: geometry that counts as parallel is 1e-7 for base parameters; noise would be blown up as much.
+SINGULAR_VALUE_RATIO: Final = 1e-8
+_MAX_REWEIGHTINGS: Final = 10
+#: Change of variances between two rounds at which they are taken as settled.
+_VARIANCE_CHANGE: Final = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The least squares of all equations.
+
+    Attributes
+    ----------
+    values : (p,) array
+        Along directions that the data cannot tell they are as far as before.
+    deviations : (p,) array
+        Standard deviations, no less than rounding; infinite where the data cannot tell a parameter.
+    null : (k, p) array
+        Directions that change no torque, each with a one that the others do not have.
+    condition : float
+        Of the matrix with columns of equal length, without those directions.
+    noise : (nv,) array
+        Standard deviation of each velocity's torque.
+    """
+
+    values: Array
+    deviations: Array
+    null: Array
+    condition: float
+    noise: Array
+
+
+def fit(equations: Sequence[Equations], start: Array, units: Array, *, weighted: bool) -> Fit:
+    """Solve the equations.
+
+    Parameters
+    ----------
+    given : sequence of Equations
+        One for each velocity.
+    start : (p,) array
+        The parameters as they are known before.
+    units : (p,) array
+        Natural sizes of the columns: one whose length is nothing beside the others in these counts as zero.
+    weighted : bool
+        Whether the equations have their weights already; else those of their noise are found.
+    """
+    noise = np.ones(len(equations))
+    for _ in range(_MAX_REWEIGHTINGS):
+        solution = _Solution(equations, noise, start, units)
+        residuals = solution.residual_noise()
+        if weighted:
+            break
+        before, noise = noise, _weighing(residuals, equations)
+        if np.abs(noise / before - 1).max(initial=0.0) < _VARIANCE_CHANGE:
+            break
+    null = solution.null
+    # Rounding of a sum of equations moves the estimates together, unlike noise of each.
+    rounding = EPS * max((x.count**0.5 * x.size for x in equations), default=0.0)
+    deviations = np.where(null.any(axis=0), np.inf, solution.deviations(np.maximum(residuals, rounding)))
+    return Fit(solution.values, deviations, null, solution.condition, residuals)
+
+
+def stacked(equations: Sequence[Equations], noise: Array) -> Array:
+    """Return all equations, each over its noise, as one triangular system, (m, p + 1)."""
+    out: Array = np.vstack([x.factor / s for x, s in zip(equations, noise, strict=True)])
+    return np.asarray(np.linalg.qr(out, mode="r")) if len(out) > out.shape[1] else out
+
+
+def _weighing(noise: Array, equations: Sequence[Equations]) -> Array:
+    """Return the noise that weighs: no less than rounding, nor so small that the other equations would not count."""
+    rounding = EPS * (max((x.size for x in equations), default=0.0) or 1.0)
+    return np.maximum(noise, max(rounding, PRINTED * float(noise.max(initial=0.0))))
+
+
+class _Solution:
+    """The least squares for noise that is given."""
+
+    def __init__(self, equations: Sequence[Equations], noise: Array, start: Array, units: Array) -> None:
+        self._given, self._noise = equations, noise
+        system = stacked(equations, noise)
+        A, b = system[:, :-1], system[:, -1]
+        lengths = np.linalg.norm(A, axis=0)
+        natural = lengths / units
+        observable = natural > SINGULAR_VALUE_RATIO * natural.max(initial=0.0)
+        scale = np.where(observable, lengths, 1.0)
+        U, sizes, axes = np.linalg.svd(np.where(observable, A / scale, 0.0))
+        rank = int(np.sum(sizes > SINGULAR_VALUE_RATIO * sizes.max(initial=0.0)))
+        self.condition = float(sizes[0] / sizes[rank - 1]) if rank else np.nan
+        #: Parameters of each unit of the directions that the data can tell.
+        self._back = axes[:rank].T / sizes[:rank] / scale[:, None]
+        self.values = start + self._back @ (U[:, :rank].T @ (b - A @ start))
+        self.null = _directions(axes[rank:], scale)
+
+    def residual_noise(self) -> Array:
+        """Return the standard deviation of each velocity's residuals, less the freedom that parameters took."""
+        equations, noise = self._given, self._noise
+        squares = np.array([np.sum((x.factor[:, :-1] @ self.values - x.factor[:, -1]) ** 2) for x in equations])
+        left = np.array([x.count - np.sum(part**2) for x, part in zip(equations, self._parts(), strict=True)])
+        # A velocity with next to no freedom left takes the noise of all of them.
+        shared = np.sum(squares / noise**2) / max(float(left.sum()), 1.0)
+        return np.asarray(np.sqrt(np.where(left >= 1.0, squares / np.maximum(left, 1.0), shared * noise**2)))
+
+    def deviations(self, noise: Array) -> Array:
+        """Return the standard deviations of the parameters if the torques have this noise."""
+        parts = [x * (s / own) for x, s, own in zip(self._parts(), noise, self._noise, strict=True)]
+        return np.asarray(np.linalg.norm(np.vstack(parts) @ self._back.T, axis=0))
+
+    def _parts(self) -> list[Array]:
+        """Return the rows of each velocity for units of the directions that the data can tell."""
+        return [x.factor[:, :-1] @ self._back / s for x, s in zip(self._given, self._noise, strict=True)]
+
+
+def _directions(null: Array, scale: Array) -> Array:
+    """Return directions in units of the parameters, with an identity matrix among their columns."""
+    if not len(null):
+        return null
+    eliminated_columns, unit = eliminated(null)
+    unit[np.abs(unit) < PRINTED * np.abs(unit).max(axis=1, keepdims=True)] = 0.0
+    return np.asarray(unit * scale[eliminated_columns, None] / scale)
+
 
 IDENTIFICATION: Final = replace(
     BASE_PARAMETERS,

@@ -15,29 +15,29 @@ from mbkit.engines.linearization import ForwardDynamicsDerivatives, InverseDynam
 
 if TYPE_CHECKING:
     from mbkit.lagrangian import systems as systems
-    from mbkit.lagrangian.continua.assumed_modes import AssumedModes as AssumedModes
     from mbkit.lagrangian.continua.beam import beam as beam
     from mbkit.lagrangian.continua.beam import clamped_free as clamped_free
     from mbkit.lagrangian.continua.continuum import Continuum as Continuum
     from mbkit.lagrangian.continua.continuum import FieldEquations as FieldEquations
+    from mbkit.lagrangian.continua.ritz import AssumedModes as AssumedModes
     from mbkit.lagrangian.continua.ritz import NormalModes as NormalModes
     from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion as EquationsOfMotion
     from mbkit.lagrangian.from_description import from_model as from_model
     from mbkit.lagrangian.independent_coordinates import Embedded as Embedded
-    from mbkit.lagrangian.printing.program_text import ProgramText as ProgramText
-    from mbkit.lagrangian.printing.program_text import program as program
+    from mbkit.lagrangian.program_text import ProgramText as ProgramText
+    from mbkit.lagrangian.program_text import program as program
     from mbkit.lagrangian.reduction.hamilton import CanonicalEquations as CanonicalEquations
     from mbkit.lagrangian.reduction.hamilton import ConservedQuantity as ConservedQuantity
     from mbkit.lagrangian.reduction.hamilton import Hamiltonian as Hamiltonian
-    from mbkit.lagrangian.reduction.impulses import ImpulseEquations as ImpulseEquations
     from mbkit.lagrangian.reduction.nonholonomic import Integrability as Integrability
     from mbkit.lagrangian.reduction.nonholonomic import NonholonomicEquations as NonholonomicEquations
+    from mbkit.lagrangian.reduction.quasi_equations import ImpulseEquations as ImpulseEquations
     from mbkit.lagrangian.reduction.quasi_equations import QuasiEquationsOfMotion as QuasiEquationsOfMotion
     from mbkit.lagrangian.reduction.routh import Routhian as Routhian
     from mbkit.lagrangian.statics.equilibrium import Equilibrium as Equilibrium
+    from mbkit.lagrangian.statics.equilibrium import portrait as portrait
     from mbkit.lagrangian.statics.newton_euler import FreeBodies as FreeBodies
     from mbkit.lagrangian.statics.newton_euler import newton_euler as newton_euler
-    from mbkit.lagrangian.statics.portrait import portrait as portrait
     from mbkit.lagrangian.statics.virtual_work import from_particles as from_particles
     from mbkit.lagrangian.statics.virtual_work import generalized_force as generalized_force
     from mbkit.lagrangian.system import Lagrangian as Lagrangian
@@ -45,22 +45,19 @@ if TYPE_CHECKING:
 
 #: Names by the modules that hold them.
 _NAMES = {
-    "continua.assumed_modes": "AssumedModes",
     "continua.beam": "beam clamped_free",
     "continua.continuum": "Continuum FieldEquations",
-    "continua.ritz": "NormalModes",
+    "continua.ritz": "AssumedModes NormalModes",
     "energies.equations_of_motion": "EquationsOfMotion",
     "from_description": "from_model",
     "independent_coordinates": "Embedded",
-    "printing.program_text": "ProgramText program",
+    "program_text": "ProgramText program",
     "reduction.hamilton": "CanonicalEquations ConservedQuantity Hamiltonian",
-    "reduction.impulses": "ImpulseEquations",
     "reduction.nonholonomic": "Integrability NonholonomicEquations",
-    "reduction.quasi_equations": "QuasiEquationsOfMotion",
+    "reduction.quasi_equations": "ImpulseEquations QuasiEquationsOfMotion",
     "reduction.routh": "Routhian",
-    "statics.equilibrium": "Equilibrium",
+    "statics.equilibrium": "Equilibrium portrait",
     "statics.newton_euler": "FreeBodies newton_euler",
-    "statics.portrait": "portrait",
     "statics.virtual_work": "from_particles generalized_force",
     "system": "Lagrangian QuasiLagrangian",
 }

@@ -16,9 +16,9 @@ from mbkit._attributes import forwarded
 from mbkit._check import Array, batch_of, real
 from mbkit._escape import html, one_line
 from mbkit.errors import UnsupportedError, require_known
-from mbkit.lagrangian.energies.casadi_equations import EnergyEquations, VelocityMap
 from mbkit.lagrangian.energies.energy_form import EnergyForm
 from mbkit.lagrangian.energies.symbols import plain
+from mbkit.lagrangian.energies.sympy_to_casadi import EnergyEquations, VelocityMap
 from mbkit.lagrangian.printer import ExpressionPrinter
 from mbkit.model import Model
 from mbkit.model.elements.kinds import Needs

@@ -215,17 +215,17 @@ def _adaptive(name: str, order: int | None, solver: str, **more: Any) -> Method:
 
 def _scipy(name: str, scheme: str, order: int | None, **more: Any) -> Method:
     # SciPy's solvers raise a smaller rtol to this by themselves.
-    return _adaptive(name, order, "scipy:run_scipy", scheme=scheme, least=100 * EPS, **more)
+    return _adaptive(name, order, "external:run_scipy", scheme=scheme, least=100 * EPS, **more)
 
 
 def _native(name: str, order: int, stability: Stability, *engines: str, **more: Any) -> Method:
-    more = {"solver": "native:run_native", "stability": stability, "callables": False, "wrenches": False, **more}
+    more = {"solver": "external:run_native", "stability": stability, "callables": False, "wrenches": False, **more}
     return Method(name, "native", order, order, _ABOUT[name], engines=engines, **more)
 
 
 def _drake(scheme: str, order: int) -> Method:
     more: dict[str, Any] = {"engines": ("drake",), "events": False, "callables": False, "wrenches": False}
-    return _adaptive(f"drake_{scheme}", order, "native:run_drake", scheme=scheme, least=1e-15, **more)
+    return _adaptive(f"drake_{scheme}", order, "external:run_drake", scheme=scheme, least=1e-15, **more)
 
 
 #: The programs that have MuJoCo's integrators.
@@ -293,7 +293,7 @@ METHODS: Final[dict[str, Method]] = {
         _drake("bogacki_shampine3", 3),
         _drake("radau3", 3),
         _drake("implicit_euler", 1),
-        _native("drake_sap", 1, IMPLICIT_IN_VELOCITY, "drake", solver="native:run_drake_discrete"),
+        _native("drake_sap", 1, IMPLICIT_IN_VELOCITY, "drake", solver="external:run_drake_discrete"),
     )
 }
 _BUILT_IN: Final = frozenset(METHODS)

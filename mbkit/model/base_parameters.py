@@ -32,10 +32,9 @@ from mbkit._check import PROBES, TYPED, Array, real, shown
 from mbkit._escape import html, terminal
 from mbkit.errors import InputError, NumericalError
 from mbkit.model import manifold
-from mbkit.model.description import Description
+from mbkit.model.description import Description, frame_of, pose_of
 from mbkit.model.elements.paths import Path
 from mbkit.model.parts import Body, Joint, Numbers, _Frozen, rules_of
-from mbkit.model.poses import frame_of, pose_of
 from mbkit.spatial import skew
 
 #: The ten standard parameters of a body, in the order of Khalil and Dombre, and the places of its inertia.

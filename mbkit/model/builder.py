@@ -19,11 +19,10 @@ from mbkit.model.elements.declare import ElementBuilder
 from mbkit.model.elements.editing import NUMBERS_OF_JOINTS, EditingBuilder
 from mbkit.model.elements.references import KINDS_OF_PARTS
 from mbkit.model.joint_types import FIXED, KINDS, JointType, kind_of
-from mbkit.model.loops import LOOP_KINDS, LoopKind
+from mbkit.model.loops import LOOP_KINDS, ROLLING_KINDS, LoopKind, RollingKind
 from mbkit.model.model import Model, unchecked
 from mbkit.model.parameters import Binding, Expression, Number, nominal, split
 from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, NoSlip, NumberRule, PointSpring, rules_of
-from mbkit.model.rolling import ROLLING_KINDS, RollingKind
 from mbkit.model.validation import body_faults, fault_sentences, static_bodies, structure_faults, suspects
 
 # The squares of sums of such lengths still fit a double.

@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import TWO_TURNS, Array, batch_of, count, generator, hint_at_degrees, real, rows
 from mbkit._escape import html
 from mbkit._imports import from_above
-from mbkit._warn import warn
-from mbkit.errors import MbkitWarning, ModelError, UnknownNameError, UnsupportedError, require_known
+from mbkit.errors import MbkitWarning, ModelError, UnknownNameError, UnsupportedError, require_known, warn
 from mbkit.model import manifold
 from mbkit.model.base_parameters import TOLERANCE, BaseParameters, base_parameters, regressor_columns
 from mbkit.model.description import SERVOS, Description, expect_name

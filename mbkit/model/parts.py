@@ -575,12 +575,12 @@ class NoSlip(_Frozen):
     """A point of body a that does not slip past body b: of a blade, or where a disc or sphere touches a plane.
 
     The velocity of a blade's point, as body b sees it, has the component `speed` along one direction. A disc or sphere
-    stays on the plane, and its point of contact has no velocity there (`mbkit.model.rolling`).
+    stays on the plane, and its point of contact has no velocity there (`mbkit.model.loops`).
 
     Attributes
     ----------
     name, kind, body_a, body_b : str
-        A `kind` is one of `mbkit.model.rolling.NO_SLIP_ROWS`.
+        A `kind` is one of `mbkit.model.loops.NO_SLIP_ROWS`.
     translation_a : (3,) array
         A blade's point, or the centre of a disc or sphere, in the axes of body a, m.
     axis_a : (3,) array

@@ -16,7 +16,7 @@ from mbkit.model.description import Description
 from mbkit.model.elements.forces import force_faults
 from mbkit.model.elements.motion_laws import motion_faults
 from mbkit.model.elements.references import KINDS_OF_PARTS, called
-from mbkit.model.loops import held_directions
+from mbkit.model.loops import LIES_FLAT, ROLLING_KINDS, held_directions
 from mbkit.model.parts import (
     RESTING,
     Body,
@@ -27,7 +27,6 @@ from mbkit.model.parts import (
     numbers,
     rest_faults,
 )
-from mbkit.model.rolling import LIES_FLAT, ROLLING_KINDS
 from mbkit.spatial import skew
 
 # Fields that add to T along a joint's velocity.

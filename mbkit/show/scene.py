@@ -10,14 +10,13 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from mbkit._check import Array, by_key, shown
-from mbkit._warn import warn
-from mbkit.errors import InputError, LoadError, MbkitWarning
+from mbkit.errors import InputError, LoadError, MbkitWarning, warn
 from mbkit.load.mjcf_attributes import has_length, z_to
 from mbkit.model import Body, Model
+from mbkit.model.description import body_poses, inertia_box
 from mbkit.model.elements.paths import OF_BODIES, Path
-from mbkit.model.poses import body_poses, inertia_box
 from mbkit.model.validation import listing
-from mbkit.show.surfaces import Color, thinned
+from mbkit.show.mesh_files import Color, thinned
 from mbkit.show.visuals import Shape, Visuals, read_visuals
 
 PICTURE: Final = Path(

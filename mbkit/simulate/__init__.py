@@ -14,11 +14,11 @@ Callers: users, every study, `mbkit simulate`.
 from mbkit._imports import make_callable
 from mbkit.methods.registry import METHODS, Method, register_method
 from mbkit.methods.tableaus import RK4, ImplicitTableau, Tableau
-from mbkit.simulate.diagnostics.stiffness import Stiffness, stiffness
 from mbkit.simulate.events import Event, Hit, at_energy, at_limits, at_section
-from mbkit.simulate.result import Stats
 from mbkit.simulate.run import simulate
+from mbkit.simulate.run_data import Stats
 from mbkit.simulate.sensitivity import Sensitivities, sensitivities
+from mbkit.simulate.stiffness_measure import Stiffness, stiffness
 from mbkit.simulate.torque import Policy, StateFeedback
 from mbkit.simulate.trajectory import RunCheck, Trajectory
 

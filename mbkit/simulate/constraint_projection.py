@@ -18,7 +18,7 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_times
 from mbkit.errors import NumericalError
-from mbkit.simulate.result import SolverResult
+from mbkit.simulate.run_data import SolverResult
 from mbkit.simulate.singular_poses import Passage, manifold_at
 
 

@@ -15,18 +15,15 @@ from typing import Any, Final, cast
 import numpy as np
 
 from mbkit._check import Array, finite_array
-from mbkit._warn import warn
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
-from mbkit.errors import FunctionError, MbkitWarning, NumericalError, UnsupportedError
+from mbkit.errors import FunctionError, MbkitWarning, NumericalError, UnsupportedError, warn
 from mbkit.lagrangian.independent_coordinates import SINGULAR_VALUE_RATIO, Chart, Embedded, EmbeddedDynamics
 from mbkit.methods.registry import METHODS, Method, method_of
 from mbkit.simulate.events import Event, Hit
 from mbkit.simulate.integrate import integrate
-from mbkit.simulate.problem import IntegrationProblem
-from mbkit.simulate.request import RunRequest
-from mbkit.simulate.result import SolverResult
-from mbkit.simulate.run_data import RunData
+from mbkit.simulate.problem import IntegrationProblem, RunRequest
+from mbkit.simulate.run_data import RunData, SolverResult
 from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result
 
 _WORN: Final = "the dependent coordinates are badly chosen"

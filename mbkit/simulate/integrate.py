@@ -10,24 +10,21 @@ from typing import Final, Protocol, runtime_checkable
 import numpy as np
 
 from mbkit._check import EPS, PRINTED, Array, batch_of, real
-from mbkit._warn import warn
 from mbkit.engines import Dynamics
 from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.constrained import unwatched
 from mbkit.engines.frames_and_momenta import axes_named
-from mbkit.errors import FunctionError, InputError, MbkitWarning, UnsupportedError
+from mbkit.errors import FunctionError, InputError, MbkitWarning, UnsupportedError, warn
 from mbkit.methods.registry import ADAPTIVE_METHOD, DEFAULT_METHOD, EULER_METHOD, METHODS, Method, Tolerances, method_of
 from mbkit.model import Model
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.simulate import solvers
+from mbkit.simulate.checks import diagnostics, massless_joints
 from mbkit.simulate.constraint_projection import along_constraints, from_consistent
-from mbkit.simulate.diagnostics.checks import diagnostics, massless_joints
 from mbkit.simulate.events import as_events
-from mbkit.simulate.problem import RUNS, IntegrationProblem
+from mbkit.simulate.problem import RUNS, IntegrationProblem, RunRequest
 from mbkit.simulate.progress import Progress
-from mbkit.simulate.request import RunRequest
-from mbkit.simulate.result import SolverResult
-from mbkit.simulate.run_data import Acting, RunData, RunSettings
+from mbkit.simulate.run_data import Acting, RunData, RunSettings, SolverResult
 from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, Indices, check_room, save_times
 from mbkit.simulate.torque import RunWrenches, Torque, TorqueFunction
 

@@ -1,25 +1,53 @@
-"""The integration problem handed to every solver."""
+"""The integration problem handed to every solver.
+
+The request for a run: what a user asks for, one value that is handed on whole.
+"""
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
+from mbkit.engines.frames_and_momenta import ALIGNED
 from mbkit.errors import InputError
-from mbkit.methods.registry import Tolerances
+from mbkit.methods.registry import DEFAULT_METHOD, Tolerances
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.events import Event
-from mbkit.simulate.progress import Progress
+from mbkit.simulate.progress import Progress, ProgressFunction
 from mbkit.simulate.time_grid import Grid, Indices, check_room, check_save
-from mbkit.simulate.torque import Torque
+from mbkit.simulate.torque import RunWrenches, Torque, TorqueFunction
+
+
+@dataclass(frozen=True, eq=False)
+class RunRequest:
+    """The arguments of `mbkit.simulate`, as they were given; its documentation has their meaning."""
+
+    q0: ArrayLike
+    v0: ArrayLike
+    duration: float
+    method: str = DEFAULT_METHOD
+    dt: float | None = None
+    rtol: float | None = None
+    atol: float | None = None
+    torque: ArrayLike | TorqueFunction | None = None
+    save: ArrayLike | int | None = None
+    progress: bool | ProgressFunction | None = None
+    events: Event | Sequence[Event] | None = None
+    doubt: bool = False
+    t0: float | None = None
+    wrenches: RunWrenches | None = None
+    wrench_axes: str = ALIGNED
+    hold: float | None = None
+
 
 #: Runs whose jumps are those of phases, or of the method.
 RUNS: Final = Path("runs", "simulate: not known of", ALL)

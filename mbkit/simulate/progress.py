@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from mbkit import _interrupt
+from mbkit import _process as _interrupt
 from mbkit._escape import one_line
 from mbkit.errors import InputError
 

@@ -7,16 +7,15 @@ from typing import TYPE_CHECKING
 
 from numpy.typing import ArrayLike
 
-from mbkit._warn import warn
 from mbkit.engines import Dynamics
 from mbkit.engines.base import no_dynamics
 from mbkit.engines.frames_and_momenta import ALIGNED
-from mbkit.errors import DoubtfulRunWarning, FunctionError, MbkitWarning
+from mbkit.errors import DoubtfulRunWarning, FunctionError, MbkitWarning, warn
 from mbkit.methods.registry import DEFAULT_METHOD
 from mbkit.simulate.events import Event
 from mbkit.simulate.integrate import integrate
+from mbkit.simulate.problem import RunRequest
 from mbkit.simulate.progress import ProgressFunction
-from mbkit.simulate.request import RunRequest
 from mbkit.simulate.torque import RunWrenches, TorqueFunction
 from mbkit.simulate.trajectory import Trajectory
 

@@ -22,12 +22,11 @@ from mbkit.engines import Dynamics
 from mbkit.errors import InputError, LoadError, MbkitWarning, UnsupportedError, writing
 from mbkit.methods.registry import AUTOMATIC_METHOD, METHODS, Method
 from mbkit.model import Model
-from mbkit.simulate.diagnostics.checks import CHECKED_TIMES, diagnostics
+from mbkit.simulate.checks import CHECKED_TIMES, diagnostics
 from mbkit.simulate.events import Hit
 from mbkit.simulate.integrate import integrate
-from mbkit.simulate.request import RunRequest
-from mbkit.simulate.result import Stats
-from mbkit.simulate.run_data import RunData, RunSettings, dynamics_of_trajectory
+from mbkit.simulate.problem import RunRequest
+from mbkit.simulate.run_data import RunData, RunSettings, Stats, dynamics_of_trajectory
 from mbkit.simulate.torque import PiecewiseConstantTorque, SampledTorque
 
 if TYPE_CHECKING:

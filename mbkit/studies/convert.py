@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from mbkit import _interrupt
+from mbkit import _process as _interrupt
 from mbkit._check import ITERATED
 from mbkit._escape import xml_holds
 from mbkit._version import __version__
@@ -19,7 +19,7 @@ from mbkit.engines import dynamics
 from mbkit.engines.registry import DERIVED
 from mbkit.errors import MbkitError, MbkitWarning, UnsupportedError, require_known, writing
 from mbkit.load import load
-from mbkit.load.urdf_writer import URDF, urdf_text
+from mbkit.load.urdf import URDF, urdf_text
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
 from mbkit.model.elements.references import KINDS_OF_PARTS

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, real, with_shapes
-from mbkit._warn import warn
 from mbkit.engines.base import Dynamics, no_dynamics
 from mbkit.engines.frames_and_momenta import ALIGNED
-from mbkit.errors import InputError, NumericalError, SingularPoseWarning
+from mbkit.errors import InputError, NumericalError, SingularPoseWarning, warn
 from mbkit.model.elements.paths import ALL, Path
 
 #: Rows of a task by name.

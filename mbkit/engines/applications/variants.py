@@ -21,10 +21,9 @@ import numpy as np
 
 from mbkit._check import ROUNDING, Array, by_key, count, finite_array, real, shown
 from mbkit._escape import csv_text, html
-from mbkit._warn import warn
 from mbkit.engines.base import Dynamics
 from mbkit.engines.registry import DERIVED, dynamics, find_engine
-from mbkit.errors import InputError, MbkitWarning, UnsupportedError, writing
+from mbkit.errors import InputError, MbkitWarning, UnsupportedError, warn, writing
 from mbkit.model.builder import expect_model, shape_of
 from mbkit.model.changes.freeing import (
     FREE,

@@ -1,6 +1,6 @@
 """Rows of constraints in numbers, for an engine that tells how frames move and knows no such rows.
 
-Each row is the formula of `mbkit.model.loops` or `mbkit.model.rolling`, on the poses of the ends and of their carrier.
+Each row is the formula of `mbkit.model.loops` or `mbkit.model.loops`, on the poses of the ends and of their carrier.
 Its rate and γ are derivatives along their motion, so that a frame's pose, Jacobian, velocity, and acceleration at v̇ = 0
 are all that an engine hands over. A new kind of loop is a formula there, and nothing here.
 """
@@ -16,13 +16,11 @@ import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.codegen.backend import DERIVING
-from mbkit.codegen.interpreter import Machine
+from mbkit.codegen.backend import DERIVING, Machine
 from mbkit.model import Model
 from mbkit.model.elements.motion_laws import MOTION_LAWS
-from mbkit.model.loops import LOOP_ROWS, LoopEnds
+from mbkit.model.loops import LOOP_ROWS, NO_SLIP_ROWS, LoopEnds, contact, tangents
 from mbkit.model.parts import Coupler, Loop, NoSlip
-from mbkit.model.rolling import NO_SLIP_ROWS, contact, tangents
 
 #: Position, velocity and acceleration of each motion at a time, by its name.
 Laws = Mapping[str, Callable[[float], tuple[float, float, float]]]

@@ -23,10 +23,10 @@ from mbkit.engines.frames_and_momenta import ALIGNED, LOCAL, WORLD, axes_named
 from mbkit.engines.loads import LOADS, Loads
 from mbkit.errors import InputError
 from mbkit.model import Frame, Joint, Model
+from mbkit.model.description import frame_of
 from mbkit.model.elements.paths import Path
 from mbkit.model.loops import LOOP_KINDS, LOOP_ROWS, LoopEnds
 from mbkit.model.parts import Loop
-from mbkit.model.poses import frame_of
 
 LOOP_LOADS: Final = Path(
     "loads of loops", "", LOADS.carries, LOADS.why, asks=(frozenset(f"loop.{x}" for x in LOOP_KINDS), "it has no loops")

@@ -5,11 +5,23 @@ that knows Drake's conventions: its bias term has no gravity, its gravity forces
 quaternion (w, x, y, z) then position, and velocities of ball and free joints are angular then linear, in the axes of
 the joint's fixed frame F: v_drake = T v with R = R_FM in T's blocks, so M = Tᵀ M_drake T, and a_drake = T a + b with
 b = R (ω × v) in the linear rows.
+
+Motion of frames, momenta and loads by Drake. A part of `DrakeDynamics`.
+
+Drake's spatial vectors are of a point, in world axes, with the angular part first in arrays. Its reaction forces are
+those of its own forward dynamics: the forces of inverse dynamics are applied, so that the motion is the one asked for.
+
+Drake's own runs: its integrators with error control on the continuous plant, and the steps of its discrete one.
+
+Constraints between bodies are in the discrete plant alone, whose SAP solver holds them (Castro, Permenter and Han 2023,
+"An unconstrained convex formulation of compliant contact"). Its step is a semi-implicit Euler's, with the forces of
+dampers and constraints at its end: the run tends to that of rigid loops with the step, in first order.
 """
 
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any, ClassVar, Final
 
@@ -17,16 +29,173 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.math import RollPitchYaw, RotationMatrix
-from pydrake.multibody.tree import MultibodyForces, MultibodyForces_
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import ExternallyAppliedSpatialForce
+from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces, MultibodyForces_
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
+from pydrake.systems.framework import EventStatus
 
+from mbkit import _process as _interrupt
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit.engines.base import MappedDynamics
-from mbkit.engines.drake.bodies import DrakeBodies
-from mbkit.engines.drake.model import DRAKE, NO_CONSTRAINTS, SAP, DrakeModel, build
-from mbkit.errors import NumericalError
-from mbkit.model import Model
+from mbkit.engines.drake.model import DRAKE, DRAKE_RUNS, DRAKE_SAP, NO_CONSTRAINTS, SAP, DrakeModel, build
+from mbkit.engines.frames_and_momenta import Composed, MovingFrames
+from mbkit.errors import NumericalError, UnsupportedError
+from mbkit.model import Frame, Model
 from mbkit.model.quantities import of_groups
+from mbkit.model.validation import static_bodies
+
+_BY_V = JacobianWrtVariable.kV
+
+
+def _linear_first(spatial: Any) -> Array:
+    return np.concatenate([spatial.translational(), spatial.rotational()])
+
+
+class DrakeBodies(MovingFrames, Composed):
+    """Drake's quantities of frames, of the whole system, and loads; `DrakeDynamics` inherits it."""
+
+    model: Model
+    maps: DrakeModel
+    plant: Any
+    _context: Any
+    # These stand in the other parts.
+    _to_engine: Callable[[Array], Array]
+    _columns: Callable[[Array], Array]
+    _force: Callable[[Array], Array]
+    _applied: Any
+
+    # Frames
+
+    def _placed(self, frame: Frame) -> tuple[Array, Array, Any]:
+        """Return R_WF and p_WF at the state that is in, and the frame's body with the place of its origin there."""
+        body, place = self.maps.bodies[frame.body], np.array(frame.translation)
+        X_WB = self.plant.EvalBodyPoseInWorld(self._context, body)
+        return X_WB.rotation().matrix() @ frame.rotation, X_WB.multiply(place), (body, place)
+
+    def _in_world(self, at: Any) -> tuple[Any, ...]:
+        """Return the arguments of Drake's Jacobians and their rates for a point, in world axes."""
+        (body, place), world = at, self.plant.world_frame()
+        return self._context, _BY_V, body.body_frame(), place, world, world
+
+    def _point_jacobian(self, p: Array, at: Any) -> tuple[Array, Array]:  # noqa: ARG002  # Drake takes the body's point
+        angular, linear = np.split(self.plant.CalcJacobianSpatialVelocity(*self._in_world(at)), 2)
+        return linear, angular
+
+    def _arm(self, p: Array, at: Any) -> Array:
+        return np.asarray(p - self.plant.EvalBodyPoseInWorld(self._context, at[0]).translation())
+
+    def _twist(self, p: Array, at: Any) -> Array:
+        return _linear_first(self.plant.EvalBodySpatialVelocityInWorld(self._context, at[0]).Shift(self._arm(p, at)))
+
+    def _move(self, q: Array, v: Array, a: Array) -> None:
+        b = self._place(q, v)
+        # They are those of the points at the bodies' origins: Drake's spatial ones have the point's own acceleration.
+        self._moving = self.plant.CalcSpatialAccelerationsFromVdot(self._context, self._to_engine(a) + b)
+
+    def _point_acceleration(self, p: Array, at: Any, w: Array) -> Array:
+        return _linear_first(self._moving[int(at[0].index())].Shift(self._arm(p, at), w))
+
+    def _point_rate(self, p: Array, at: Any) -> Array:  # noqa: ARG002  # Drake takes the body's point
+        return _linear_first(self.plant.CalcBiasSpatialAcceleration(*self._in_world(at)))
+
+    # The whole
+
+    def _center_of_mass(self, q: Array) -> Array:
+        self._place(q)
+        return np.asarray(self.plant.CalcCenterOfMassPositionInWorld(self._context))
+
+    def _center_of_mass_velocity(self, q: Array, v: Array) -> Array:
+        self._place(q, v)
+        return np.asarray(self.plant.CalcCenterOfMassTranslationalVelocityInWorld(self._context))
+
+    def _center_of_mass_acceleration(self, q: Array, v: Array, a: Array) -> Array:
+        b, world = self._place(q, v), self.plant.world_frame()
+        J = self.plant.CalcJacobianCenterOfMassTranslationalVelocity(self._context, _BY_V, world, world)
+        rate = self.plant.CalcBiasCenterOfMassTranslationalAcceleration(self._context, _BY_V, world, world)
+        return np.asarray(J @ (self._to_engine(a) + b) + rate)
+
+    def _center_of_mass_jacobian(self, q: Array) -> Array:
+        self._place(q)
+        world = self.plant.world_frame()
+        return self._columns(
+            self.plant.CalcJacobianCenterOfMassTranslationalVelocity(self._context, _BY_V, world, world)
+        )
+
+    def _centroidal_momentum(self, q: Array, v: Array) -> Array:
+        self._place(q, v)
+        center = self.plant.CalcCenterOfMassPositionInWorld(self._context)
+        return _linear_first(self.plant.CalcSpatialMomentumInWorldAboutPoint(self._context, center))
+
+    def _locked_inertia(self, q: Array) -> Array:
+        self._place(q)
+        plant, context = self.plant, self._context
+        every = [body.index() for name, body in self.maps.bodies.items() if name != "world"]
+        whole = plant.CalcSpatialInertia(context, plant.world_frame(), every)
+        angular_first = whole.Shift(whole.get_com()).CopyToFullMatrix6()
+        out = np.zeros((6, 6))
+        out[:3, :3], out[3:, 3:] = angular_first[3:, 3:], angular_first[:3, :3]
+        # The plant holds what never moves as points, because Drake refuses some of these inertias.
+        static = static_bodies(self.model.joints)
+        for body in self.model.bodies:
+            if body.name in static:
+                R = plant.EvalBodyPoseInWorld(context, self.maps.bodies[body.name]).rotation().matrix()
+                out[3:, 3:] += R @ body.inertia @ R.T
+        return out
+
+    # Loads
+
+    def _on_bodies(self, *acting: Any) -> Iterator[tuple[Any, Any]]:
+        """Yield bodies and forces about their origins in world axes, of wrenches at the state that is in."""
+        for force, moment, point, at in self._external(*acting):
+            yield at[0], SpatialForce(tau=moment, f=force).Shift(-self._arm(point, at))
+
+    def _add_external(self, forces: Any, *acting: Any) -> Any:
+        for body, force in self._on_bodies(*acting):
+            body.AddInForceInWorld(self._context, force, forces)
+        return forces
+
+    def _generalized_force(self, q: Array, wrenches: Array, frames: tuple[Frame, ...], axes: str) -> Array:
+        self._place(q)
+        forces = self._add_external(MultibodyForces(self.plant), wrenches, frames, axes)
+        return self._force(self.plant.CalcGeneralizedForces(self._context, forces))
+
+    @contextlib.contextmanager
+    def _pushed(self, *acting: Any) -> Iterator[None]:
+        """Hold wrenches, at the state that is in, on Drake's port."""
+        port = self.plant.get_applied_spatial_force_input_port()
+        held = []
+        for body, force in self._on_bodies(*acting):
+            one = ExternallyAppliedSpatialForce()
+            one.body_index, one.p_BoBq_B, one.F_Bq_W = body.index(), np.zeros(3), force
+            held.append(one)
+        port.FixValue(self._context, held)
+        try:
+            yield
+        finally:
+            port.FixValue(self._context, [])
+
+    def _joint_wrenches(self, q: Array, v: Array, a: Array, *given: Any) -> Array:
+        *wrenches, joints, frames, axes = given
+        acting = (wrenches[0] if wrenches else np.empty(0), frames, axes)
+        b = self._place(q, v)
+        moved = self._to_engine(a) + b
+        forces = MultibodyForces(self.plant)
+        self.plant.CalcForceElementsContribution(self._context, forces)
+        with self._pushed(*acting):
+            forces = self._add_external(forces, *acting)
+            # For Drake's own forward dynamics: these forces make the motion the one asked for.
+            self._applied.FixValue(self._context, self.plant.CalcInverseDynamics(self._context, moved, forces))
+            reactions = self.plant.get_reaction_forces_output_port().Eval(self._context)
+        return np.array([_on_child(self.maps.joints[joint.name], reactions) for joint in joints]).reshape(-1, 6)
+
+
+def _on_child(joint: Any, reactions: Any) -> Array:
+    """Return a joint's reaction about its child's origin, in the child's axes."""
+    reaction, X_CJ = reactions[int(joint.index())], joint.frame_on_child().GetFixedPoseInBodyFrame()
+    return _linear_first(reaction.Rotate(X_CJ.rotation()).Shift(-X_CJ.translation()))
+
 
 _WITHOUT_LOOPS: Final = {
     **dict.fromkeys(
@@ -229,3 +398,122 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
         plant, context = self._without_bushings
         self.put(plant, context, x, u)
         return total + plant.CalcPotentialEnergy(context)
+
+
+class _PlantState:
+    """A state in a plant of a description, in the description's numbers."""
+
+    def __init__(self, dyn: DrakeDynamics, maps: DrakeModel) -> None:
+        self._dyn, self._layout, self._maps, self._plant = dyn, dyn.model.layout, maps, maps.plant
+        self._context = maps.plant.CreateDefaultContext()
+        self._force = maps.plant.get_applied_generalized_force_input_port()
+        self.push(np.zeros(dyn.model.nv))
+
+    def put(self, q: Array, v: Array) -> None:
+        """Go on from a state."""
+        self._dyn.put(self._plant, self._context, *self._dyn.to_drake(q, v)[:2])
+
+    def push(self, tau: Array) -> None:
+        """Hold a generalized force from now on; `UnsupportedError` for bodies that turn freely."""
+        if tau.any() and self._maps.turning:
+            raise UnsupportedError(
+                "drake: a force on a free joint would be held in world axes; use a method that any engine has"
+            )
+        self._force.FixValue(self._context, self._layout.expand_v(tau)[self._maps.v_index])
+
+    def state(self) -> tuple[Array, Array]:
+        """Return q and v, with unit quaternions."""
+        layout, maps = self._layout, self._maps
+        x, u = self._plant.GetPositions(self._context), self._plant.GetVelocities(self._context)
+        q, v = np.empty(layout.sizes[2]), np.empty(layout.sizes[3])
+        q[maps.q_index] = x
+        for joint, _, iv in maps.turning:
+            quaternion = q[layout.full_q[joint.name]][-4:]
+            quaternion /= np.linalg.norm(quaternion)
+            R = spatial.matrix_from_quaternion(quaternion)
+            u[iv : iv + 3], u[iv + 3 : iv + 6] = R.T @ u[iv : iv + 3], R.T @ u[iv + 3 : iv + 6]
+        v[maps.v_index] = u
+        return q, v
+
+
+class DrakeRun(_PlantState):
+    """A state that one of Drake's integrators carries on; `scheme` is of `pydrake.systems.analysis`.
+
+    `accuracy` bounds the relative error of a step; `watch` gets the time, s, after each step and may raise.
+    """
+
+    def __init__(
+        self,
+        dyn: DrakeDynamics,
+        scheme: str,
+        accuracy: float,
+        t: float,
+        q: Array,
+        v: Array,
+        watch: Callable[[float], object],
+    ) -> None:
+        DRAKE_RUNS.admit(dyn.model)
+        super().__init__(dyn, dyn.maps)
+        self.put(q, v)
+        simulator = Simulator(self._plant, self._context)
+        config = SimulatorConfig(integration_scheme=scheme, accuracy=accuracy)
+        ApplySimulatorConfig(config, simulator)
+        # The configuration resets the time.
+        self._context.SetTime(t)
+        integrator = simulator.get_mutable_integrator()
+        # Too small a step is an error, not carried on with an error that nobody knows.
+        integrator.set_throw_on_minimum_step_size_violation(True)
+
+        self._left = False
+
+        def monitor(context: Any) -> Any:
+            if self._left:
+                return EventStatus.ReachedTermination(None, "interrupted")
+            watch(context.get_time())
+            return EventStatus.DidNothing()
+
+        simulator.set_monitor(monitor)
+        self._simulator, self._integrator = simulator, integrator
+
+    def over(self, t: float) -> tuple[Array, Array]:
+        """Go on to a time, s; return q and v there."""
+        try:
+            # Within a step Drake does not look for signals.
+            _interrupt.beside(lambda: self._simulator.AdvanceTo(t))
+        except BaseException:
+            self._left = True
+            raise
+        return self.state()
+
+    @property
+    def steps(self) -> int:
+        """Accepted steps."""
+        return int(self._integrator.get_num_steps_taken())
+
+    @property
+    def evaluations(self) -> int:
+        """Evaluations of the dynamics."""
+        return int(self._integrator.get_num_derivative_evaluations())
+
+    @property
+    def rejected(self) -> int:
+        """Rejected steps."""
+        of = self._integrator
+        return int(of.get_num_step_shrinkages_from_error_control() + of.get_num_step_shrinkages_from_substep_failures())
+
+
+class DiscreteRun(_PlantState):
+    """Steps of the discrete plant of dt s, with the loops among its constraints."""
+
+    def __init__(self, dyn: DrakeDynamics, dt: float) -> None:
+        DRAKE_SAP.admit(dyn.model)
+        super().__init__(dyn, build(dyn.model, step=dt))
+
+    def step(self, q: Array, v: Array, tau: Array) -> tuple[Array, Array]:
+        """Return q and v a step after a state, under a force."""
+        self.put(q, v)
+        # A force on a free joint turns with its body, from step to step.
+        self._force.FixValue(self._context, self._dyn.to_drake(q, tau)[1])
+        # As a simulator does at each period, without its clock.
+        self._plant.ExecuteForcedEvents(self._context, publish=False)
+        return self.state()

@@ -11,9 +11,9 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.codegen.backend import DERIVING, compile_by_default, executable
-from mbkit.derivation.elements.forces import ElementForces
+from mbkit.derivation.forces import ElementForces
 from mbkit.derivation.kinematics import Kinematics
-from mbkit.engines.elements.added_force import AddedForce
+from mbkit.engines.elements.passive import AddedForce
 from mbkit.model import Model
 
 

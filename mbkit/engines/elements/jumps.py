@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 
 from mbkit._check import EPS, Array
 from mbkit._reproducible import unit_rows
-from mbkit._warn import warn
-from mbkit.engines.elements.added_force import LOADS, UNDER_FORCE, AddedForce
-from mbkit.errors import MbkitWarning, NumericalError, UnsupportedError
+from mbkit.engines.elements.passive import LOADS, UNDER_FORCE, AddedForce
+from mbkit.errors import MbkitWarning, NumericalError, UnsupportedError, warn
 from mbkit.model import Model
 from mbkit.model.changes.jumps import JumpLaw, Sliding, jump_bindings
 from mbkit.model.parts import POSE_ROUNDING, RESTING, ROUNDING

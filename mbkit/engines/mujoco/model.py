@@ -3,6 +3,8 @@
 MuJoCo puts several joints into one body, first to last: a universal joint is two hinges, a spherical-ZYX joint three, a
 planar joint two slides and a hinge, and a free joint that does not hang directly in the world three slides and a ball
 (the same velocities: linear in the parent's axes, angular in the body's). So does a body without mass between two.
+
+Sites and shapes on the bodies of a MuJoCo specification: neither has mass, and nothing collides.
 """
 
 from __future__ import annotations
@@ -22,15 +24,17 @@ from mbkit.engines.mujoco.constraints import EQUALITIES, OF_JOINTS, OF_TENDON, S
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.load.mjcf import JOINT_NUMBERS
 from mbkit.load.mjcf_attributes import matrix_of
-from mbkit.load.xml_reader import unused
+from mbkit.load.xml_reader import reserved, unused
 from mbkit.model import Body, Bushing, GravityCompensation, Joint, Model
 from mbkit.model.elements.kinds import EFFECTS, joint_types
 from mbkit.model.elements.paths import Path
 from mbkit.model.parts import JointCoupling, rules_of
 from mbkit.model.validation import static_bodies
+from mbkit.show import Shape
 
 if TYPE_CHECKING:
     from mbkit.show import Shape
+
 
 # What is global in MuJoCo. 4.0, the lower bound, is the first whose Runge–Kutta on rotations is of fourth order.
 
@@ -114,7 +118,6 @@ def build(
                 body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-6, 0, 0], pos=body.ipos, mass=0.0)
     if shapes is not None:
         # Imported late: few scripts draw.
-        from mbkit.engines.mujoco.visuals import add_shapes
 
         add_shapes(spec, placed.bodies, description, shapes)
     # A singular M at the zero configuration is an error only where it is solved with.
@@ -559,3 +562,34 @@ def mapped(
             free.append((q[0], v[0]))
     ids = {name: model.body(name).id for name in bodies if name != "world"} | {"world": 0}
     return MujocoModel(model, q_index, v_index, tuple(free), ids, frozenset(absorbed), disabled)
+
+
+def add_shapes(spec: Any, bodies: Mapping[str, Any], description: Model, shapes: Sequence[Shape]) -> None:
+    """Add a site for each frame and geoms for the shapes; those on bodies that MuJoCo does not have are left out."""
+    taken = {site.name for site in spec.sites}
+    for frame in description.frames:
+        if frame.body in bodies:
+            name = reserved(frame.name, taken)
+            bodies[frame.body].add_site(name=name, pos=frame.translation, quat=wxyz(frame.rotation))
+    meshes: dict[int, str] = {}
+    names: set[str] = set()
+    for shape in shapes:
+        if shape.body not in bodies:
+            continue
+        look: dict[str, Any] = {"pos": shape.translation, "quat": wxyz(shape.rotation), "group": 2}
+        look |= {"mass": 0.0, "contype": 0, "conaffinity": 0}
+        body = bodies[shape.body]
+        look["type"] = getattr(mujoco.mjtGeom, f"mjGEOM_{shape.kind.upper()}")
+        if shape.kind != "mesh":
+            size = [*shape.size, 0.0, 0.0][:3]
+            body.add_geom(name=reserved(shape.name, names), size=size, rgba=shape.color, **look)
+            continue
+        for surface in shape.meshes:
+            if id(surface) not in meshes:
+                meshes[id(surface)] = f"mesh{len(meshes)}"
+                mesh = spec.add_mesh(name=meshes[id(surface)])
+                mesh.uservert, mesh.userface = surface.vertices.ravel(), surface.triangles.ravel()
+                # Surfaces with holes have no volume.
+                mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+            name, rgba = reserved(shape.name, names), surface.color or shape.color
+            body.add_geom(name=name, meshname=meshes[id(surface)], rgba=rgba, **look)

@@ -163,7 +163,7 @@ class PinConstraints:
 
     @cached_property
     def _laws(self) -> Laws:
-        from mbkit.derivation.elements.motions import law_rates
+        from mbkit.derivation.forces import law_rates
 
         return {x.name: law_rates(x) for x in motions_of(self._model)}
 

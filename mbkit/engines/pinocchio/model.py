@@ -3,14 +3,17 @@
 Joints are added depth first, because Pinocchio's algorithms take a subtree to be contiguous. Continuous joints are
 plain revolute ones, with one angle. A planar joint is two slides and a hinge, whose velocities are the derivatives of
 its coordinates (Pinocchio's own planar joint has four numbers and body velocities).
+
+Pinocchio's geometry model of the shapes of a description.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+import coal
 import numpy as np
 import pinocchio as pin
 
@@ -18,9 +21,11 @@ from mbkit._check import Array
 from mbkit.engines.base import OF_COUPLINGS, OF_TREES, SOLVED
 from mbkit.engines.elements.passive import pull
 from mbkit.load.urdf import OF_VELOCITIES
+from mbkit.load.xml_reader import reserved
 from mbkit.model import Body, Joint, Model, PointSpring
 from mbkit.model.elements.kinds import joint_types
 from mbkit.model.elements.paths import Path
+from mbkit.show import Shape
 
 _X, _Y, _Z = np.eye(3)
 
@@ -203,3 +208,45 @@ class PointSprings:
         J = pin.getJointJacobian(m, d, joint, pin.LOCAL).reshape(6, m.nv)
         R = d.oMi[joint].rotation
         return np.asarray(R @ (J[:3] - pin.skew(point) @ J[3:]))
+
+
+#: Kind -> coal's solid; boxes and heights are whole lengths there.
+_SOLIDS: Final[dict[str, Callable[..., Any]]] = {
+    "box": lambda a, b, c: coal.Box(2 * a, 2 * b, 2 * c),
+    "sphere": coal.Sphere,
+    "cylinder": lambda r, half: coal.Cylinder(r, 2 * half),
+    "capsule": lambda r, half: coal.Capsule(r, 2 * half),
+    "ellipsoid": coal.Ellipsoid,
+}
+
+
+def geometry(maps: PinModel, shapes: Sequence[Shape]) -> Any:
+    """Return the geometry model; a mesh of several colours is as many objects."""
+    out = pin.GeometryModel()
+    names: set[str] = set()
+    meshes: dict[int, Any] = {}
+    for shape in shapes:
+        carrier, R, p = maps.bodies[shape.body]
+        place = pin.SE3(R @ shape.rotation, p + R @ shape.translation)
+        frame = maps.model.getFrameId(shape.body) if shape.body != "world" else 0
+        if shape.kind != "mesh":
+            solids = [(_SOLIDS[shape.kind](*shape.size), shape.color)]
+        else:
+            for surface in shape.meshes:
+                if id(surface) not in meshes:
+                    meshes[id(surface)] = _mesh(surface.vertices, surface.triangles)
+            solids = [(meshes[id(surface)], surface.color or shape.color) for surface in shape.meshes]
+        for solid, color in solids:
+            one = pin.GeometryObject(reserved(shape.name, names), carrier, frame, place, solid)
+            one.meshColor, one.overrideMaterial = np.array(color), True
+            out.addGeometryObject(one)
+    return out
+
+
+def _mesh(vertices: Any, triangles: Any) -> Any:
+    mesh = coal.BVHModelOBBRSS()
+    mesh.beginModel(len(triangles), len(vertices))
+    mesh.addVertices(vertices)
+    mesh.addTriangles(triangles)
+    mesh.endModel()
+    return mesh

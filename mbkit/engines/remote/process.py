@@ -18,7 +18,7 @@ from typing import Any, Final
 
 from mbkit._check import Array
 from mbkit._child_process import Child, WorkerDiedError, WorkerStartError, WorkerTimeoutError
-from mbkit._fork import fork_safe
+from mbkit._process import fork_safe
 from mbkit.engines.remote.packages import EngineVersion
 from mbkit.engines.remote.served import serve
 from mbkit.errors import EngineProcessError, UnsupportedError

@@ -14,8 +14,7 @@ import sympy as sp
 from sympy.core.function import AppliedUndef, UndefinedFunction
 
 from mbkit._check import Array, real
-from mbkit._warn import warn
-from mbkit.errors import InputError, MbkitWarning, require_known
+from mbkit.errors import InputError, MbkitWarning, require_known, warn
 from mbkit.lagrangian.energies.kinetic_energy import KineticSplit, require_inertia, split, warn_of_negative
 from mbkit.lagrangian.energies.symbols import (
     PlainSymbols,

@@ -12,8 +12,7 @@ import numpy as np
 import sympy as sp
 
 from mbkit._check import PROBES, ROUNDING
-from mbkit._warn import warn
-from mbkit.errors import InputError, MbkitWarning
+from mbkit.errors import InputError, MbkitWarning, warn
 from mbkit.lagrangian.trig.simplify import (
     MAX_SIMPLIFIED_OPERATIONS,
     PROBE_DIGITS,

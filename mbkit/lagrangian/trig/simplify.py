@@ -20,8 +20,16 @@ from numpy.random import default_rng
 from sympy.core.function import AppliedUndef
 
 from mbkit.errors import UnsupportedError
-from mbkit.lagrangian.trig.polynomial import MAX_READABLE_TERMS, Key, TrigPolynomial, TrigRing, quotient
-from mbkit.lagrangian.trig.shortest_form import MAX_COMBINED_TERMS, complexity, shortest_form
+from mbkit.lagrangian.trig.shortest_form import (
+    MAX_COMBINED_TERMS,
+    MAX_READABLE_TERMS,
+    Key,
+    TrigPolynomial,
+    TrigRing,
+    complexity,
+    quotient,
+    shortest_form,
+)
 
 #: Operations up to which an expression is simplified.
 MAX_SIMPLIFIED_OPERATIONS: Final = 2000

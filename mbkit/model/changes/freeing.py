@@ -18,10 +18,10 @@ from mbkit._check import Array, shown
 from mbkit.errors import InputError, did_you_mean
 from mbkit.model.elements.paths import OF_BODIES, Path
 from mbkit.model.elements.references import KINDS_OF_PARTS
+from mbkit.model.loops import ROLLING_KINDS
 from mbkit.model.model import Model
 from mbkit.model.parameters import Binding, Parameter
 from mbkit.model.parts import ENTRIES, Body, Joint, NumberRule, numbers, rules_of
-from mbkit.model.rolling import ROLLING_KINDS
 from mbkit.model.validation import static_bodies
 
 SYMMETRIC: Final = (

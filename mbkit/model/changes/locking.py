@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import CONSISTENT, Array, batch_of, finite_array, hint_at_degrees, rows, shown
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model.builder import shape_of
-from mbkit.model.description import expect_name
+from mbkit.model.description import body_poses, expect_name
 from mbkit.model.elements.forces import (
     RATE,
     Force,
@@ -36,7 +36,6 @@ from mbkit.model.loops import LOOP_ROWS, LoopEnds
 from mbkit.model.model import Model
 from mbkit.model.parameters import Binding, Expression, nominal
 from mbkit.model.parts import Coupler, Joint, JointCoupling, Loop, NoSlip, PointSpring
-from mbkit.model.poses import body_poses
 
 #: The energies, losses, forces and rows of what moves no more are written on what still does.
 LOCK: Final = Path("lock", "lock: not known of", OF_BODIES)

@@ -19,9 +19,8 @@ from mbkit.model.elements.forces import Bushing, FrameForce, GravityCompensation
 from mbkit.model.elements.motion_laws import MOTION_LAWS
 from mbkit.model.elements.references import KINDS_OF_PARTS
 from mbkit.model.joint_types import kind_of
-from mbkit.model.loops import LOOP_KINDS
+from mbkit.model.loops import LOOP_KINDS, NO_SLIP_ROWS
 from mbkit.model.parts import rules_of
-from mbkit.model.rolling import NO_SLIP_ROWS
 
 #: A `mbkit.model.description.Description`, a floor above.
 _Model = Any

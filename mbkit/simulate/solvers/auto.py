@@ -21,12 +21,12 @@ from mbkit._check import Array
 from mbkit.errors import FunctionError, NumericalError
 from mbkit.methods.registry import ADAPTIVE_METHOD, SERIES_METHOD, STIFF_METHOD, Tolerances
 from mbkit.model.integration_space import Space
-from mbkit.simulate.diagnostics.stiffness import Stiffness, linearized, stiffness_of
 from mbkit.simulate.problem import IntegrationProblem
-from mbkit.simulate.result import SolverResult
+from mbkit.simulate.run_data import SolverResult
 from mbkit.simulate.solvers.adaptive import make_attempts, march, run_groups
 from mbkit.simulate.solvers.step_attempts import StepAttempts
 from mbkit.simulate.solvers.trajectory_record import ROUNDS, AcceptedSteps, TrajectoryRecord, assemble_result
+from mbkit.simulate.stiffness_measure import Stiffness, linearized, stiffness_of
 
 EXPLICIT, IMPLICIT = ADAPTIVE_METHOD, STIFF_METHOD
 #: Tightest relative tolerance: below it rounding would count as error, and steps shrink without end.

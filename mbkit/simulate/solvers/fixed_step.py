@@ -16,7 +16,7 @@ from mbkit.methods.registry import method_of
 from mbkit.methods.tableaus import ImplicitTableau, Tableau
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
-from mbkit.simulate.result import SolverResult
+from mbkit.simulate.run_data import SolverResult
 from mbkit.simulate.singular_poses import SingularPosesOfBatch, manifold_at
 from mbkit.simulate.solvers.gauss import CollocationStep, StepNearPose
 from mbkit.simulate.solvers.trajectory_record import GridRecord

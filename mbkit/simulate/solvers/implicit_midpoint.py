@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import EPS, Array
-from mbkit.codegen.interpreter import Machine
+from mbkit.codegen.backend import Machine
 from mbkit.derivation.mass_matrix_solve import factors_written_out
-from mbkit.derivation.steps.constrained_midpoint import ConstrainedMidpoint
 from mbkit.derivation.steps.fixed import Part
 from mbkit.derivation.steps.midpoint import (
     GUESS_WEIGHTS,
     MAX_LAST_CORRECTION,
     MAX_LAST_MOVE,
     MAX_NEWTON_ITERATIONS,
+    ConstrainedMidpoint,
     Midpoint,
 )
 from mbkit.engines.lagrangian import LagrangianDynamics
@@ -29,7 +29,7 @@ from mbkit.methods.registry import IMPLICIT_METHODS
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
-from mbkit.simulate.result import SolverResult
+from mbkit.simulate.run_data import SolverResult
 from mbkit.simulate.singular_poses import SingularPosesOfBatch
 from mbkit.simulate.solvers.fixed_step import STAGES_NEAR_POSE, SteppedRun, Stepper
 from mbkit.simulate.solvers.gauss import StepNearPose
@@ -59,7 +59,7 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
         (pi0,) = called(dyn, midpoint.momentum, None, problem.start, q0, problem.v)
         if _machine_code(dyn, midpoint, problem):
             # It loads LLVM, which interpreting never needs.
-            from mbkit.simulate.solvers.machine_code.implicit_steps import run_implicit
+            from mbkit.simulate.solvers.machine_code_blocks import run_implicit
 
             def velocity(t: float, q: Array, pi: Array, members: Indices) -> Array:
                 return _velocities(dyn, midpoint, members, t, q, pi)

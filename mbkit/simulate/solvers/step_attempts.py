@@ -1,6 +1,6 @@
 """Attempts of rk853 and rodas5, one step of one trajectory at a time, on any engine and under any torque.
 
-`StepAttempts` says what attempts are asked; those in machine code are in `mbkit.simulate.solvers.adaptive_compiled`.
+`StepAttempts` says what attempts are asked; those in machine code are in `mbkit.simulate.solvers.adaptive`.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from mbkit.methods.registry import Tolerances
 from mbkit.methods.tableaus import EmbeddedTableau, RosenbrockTableau, dormand_prince_853, rodas5p
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import unit_quaternions
-from mbkit.simulate.diagnostics.stiffness import RateJacobian
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.singular_poses import AHEAD, LOOSEST, Approach
 from mbkit.simulate.solvers.gauss import AT_END, StepNearPose, StepPolynomial
 from mbkit.simulate.solvers.trajectory_record import AcceptedSteps, StoppedError, below_rounding, diverged
 from mbkit.simulate.solvers.vector_field import DivergenceError, Field, Rates
+from mbkit.simulate.stiffness_measure import RateJacobian
 from mbkit.simulate.torque import Force
 
 

@@ -17,7 +17,7 @@ from mbkit.engines.oracle import OracleDynamics
 from mbkit.methods.registry import ADAPTIVE_METHOD
 from mbkit.model.manifold import magnitude
 from mbkit.simulate.problem import IntegrationProblem
-from mbkit.simulate.result import SolverResult
+from mbkit.simulate.run_data import SolverResult
 from mbkit.simulate.solvers.step_attempts import AcrossPoses
 from mbkit.simulate.solvers.trajectory_record import (
     StoppedError,

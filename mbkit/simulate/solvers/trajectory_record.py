@@ -17,7 +17,7 @@ from mbkit.model.integration_space import Space
 from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.events import Hit, State, Watch
 from mbkit.simulate.problem import IntegrationProblem
-from mbkit.simulate.result import Ended, SolverResult, Stats
+from mbkit.simulate.run_data import Ended, SolverResult, Stats
 from mbkit.simulate.singular_poses import SingularPoses, describe_poses
 from mbkit.simulate.solvers.vector_field import DIVERGED, are_bounded
 from mbkit.simulate.time_grid import Indices

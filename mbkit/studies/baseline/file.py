@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit import _interrupt
+from mbkit import _process as _interrupt
 from mbkit._check import Array
 from mbkit._escape import json_text
 from mbkit.errors import BaselineError, InputError, OutputError

@@ -19,7 +19,7 @@ from mbkit.simulate.plotting.style import (
     name_points,
     new_figure,
 )
-from mbkit.studies.compare.rows import Row, by_term
+from mbkit.studies.compare.terms import Row, by_term
 from mbkit.studies.formatting import error_text, time_text
 from mbkit.studies.svg import PAGE, PAGE_WIDTH_INCHES, page_style, svg
 

@@ -34,8 +34,7 @@ from mbkit.show.scene import SHAPES
 from mbkit.show.visuals import Shape, read_visuals
 from mbkit.studies._targets import model_of, with_values
 from mbkit.studies.explain.merged_model import Tolerances
-from mbkit.studies.lint.checks import CHECKS, Judged
-from mbkit.studies.lint.geometry import Geometry, geometry_of
+from mbkit.studies.lint.checks import CHECKS, Geometry, Judged, geometry_of
 from mbkit.studies.lint.result import SURENESS, LintResult
 from mbkit.studies.results import provenance
 

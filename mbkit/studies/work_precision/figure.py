@@ -23,7 +23,7 @@ from mbkit.simulate.plotting.style import (
 )
 from mbkit.studies.measurement import Measurement
 from mbkit.studies.svg import PAGE_WIDTH_INCHES
-from mbkit.studies.work_precision.curve import Curve, pareto_front
+from mbkit.studies.work_precision.sweep import Curve, pareto_front
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

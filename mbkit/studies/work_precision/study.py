@@ -17,12 +17,11 @@ from mbkit.methods.registry import METHODS
 from mbkit.model import Model
 from mbkit.simulate.torque import TorqueFunction
 from mbkit.studies import results
-from mbkit.studies._checkpoint import Checkpoint, Checkpointer, Progress
+from mbkit.studies._checkpoint import Checkpoint, Checkpointer, Progress, integrable, require_motion, start_state
 from mbkit.studies._targets import methods_by_engine, numbers_of, with_values
 from mbkit.studies.measurement import Problem, Truth, farthest
-from mbkit.studies.motions.reference import Reference
-from mbkit.studies.motions.reference import reference as compute_reference
-from mbkit.studies.study_runs import integrable, require_motion, start_state
+from mbkit.studies.reference_motions import Reference
+from mbkit.studies.reference_motions import reference as compute_reference
 from mbkit.studies.work_precision.result import WorkPrecision
 from mbkit.studies.work_precision.sweep import INTERVALS, Sweep, TimeBudget, plans
 from mbkit.studies.worker import check_executor
@@ -104,7 +103,7 @@ def work_precision(
         Measures one curve a call: a pool of processes, Dask's or MPI's. Errors do not depend on it; run times do,
         because workers share the cores.
     reference : Reference or callable, optional
-        The motion: from `mbkit.studies.motions.reference`, whose times are then the saved ones, or an exact
+        The motion: from `mbkit.studies.reference_motions`, whose times are then the saved ones, or an exact
         function from t to (q, v). By default it is computed.
     progress : callable, optional
         Called as ``progress(fraction, text)``. An exception of it ends the study, after `checkpoint` has the result.
@@ -129,7 +128,7 @@ def work_precision(
     a step on each, so they take ten at the least). First everything that belongs to the model is derived, compiled and
     built with empty caches, timed apart. Then all settings are run once, the cheapest next run of all curves first,
     until finer settings bring no smaller error or would take too much work. Then they are timed in rounds, each round
-    in another order. For the observed order see `mbkit.studies.work_precision.curve.observed_order`.
+    in another order. For the observed order see `mbkit.studies.work_precision.sweep.observed_order`.
 
     A script that hands over a pool of processes needs ``if __name__ == "__main__":``, and the pool a context that does
     not fork, such as ``ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))``. With Dask, ``pip install

@@ -23,7 +23,7 @@ from mbkit.model.parts import STOPPED
 from mbkit.simulate.events import Hit
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
-from mbkit.simulate.result import Ended, SolverResult
+from mbkit.simulate.run_data import Ended, SolverResult
 from mbkit.simulate.solvers.in_phases.phases import Phase, Phases, force_of, of_each, side_by_side
 from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.time_grid import Grid, Indices

@@ -18,7 +18,7 @@ from mbkit.engines.elements.jumps import jump_forces
 from mbkit.errors import FunctionError, NumericalError
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
-from mbkit.simulate.result import SolverResult
+from mbkit.simulate.run_data import SolverResult
 from mbkit.simulate.singular_poses import SingularPosesOfBatch
 from mbkit.simulate.solvers.fixed_step import SteppedRun, Stepper
 from mbkit.simulate.solvers.in_phases.phases import Phases, applied, side_by_side

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Final, get_args
 
 from mbkit.errors import require_known
-from mbkit.studies.stress.case import Case, Family
-from mbkit.studies.stress.cases._common import TABLE
+from mbkit.studies.stress.case import TABLE, Case, Family
 
 # They fill the table, in this order within a family.
 from mbkit.studies.stress.cases import springs, rigid, loops  # noqa: F401  # isort: skip

@@ -14,12 +14,12 @@ from mbkit import catalog
 from mbkit._check import EPS, Array
 from mbkit.derivation.constraints import choose_rows
 from mbkit.engines import dynamics
-from mbkit.engines.consistent.random_states import states_of
+from mbkit.engines.applications.random_states import states_of
 from mbkit.engines.registry import PINOCCHIO
 from mbkit.model import Model, ModelBuilder
 from mbkit.model.parts import Prescribed
 from mbkit.studies.measurement import Problem
-from mbkit.studies.stress.cases._common import case, motion, powers
+from mbkit.studies.stress.case import case, motion, powers
 
 #: Crank, coupler and rocker of the four-bar that is cut down to a change point, m.
 _CRANK, _COUPLER, _ROCKER = 0.3, 0.9, 0.7

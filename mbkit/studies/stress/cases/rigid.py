@@ -15,10 +15,10 @@ from mbkit import catalog, lagrangian
 from mbkit._check import EPS, Array
 from mbkit.load import load
 from mbkit.model import Body, Model, ModelBuilder
+from mbkit.studies import exact_motions as exact_motions
+from mbkit.studies.exact_motions import Exact
 from mbkit.studies.measurement import Problem
-from mbkit.studies.motions import exact as exact_motions
-from mbkit.studies.motions.exact import Exact
-from mbkit.studies.stress.cases._common import SWING, Facts, case, motion, powers, terms_at
+from mbkit.studies.stress.case import SWING, Facts, case, motion, powers, terms_at
 
 # Heavy beside light: masses that differ along a chain, and in a robot's hand
 

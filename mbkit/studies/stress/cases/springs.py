@@ -14,9 +14,9 @@ from mbkit import catalog
 from mbkit._check import EPS, Array
 from mbkit.model import Model, ModelBuilder
 from mbkit.model.validation import sample_mass_matrix
+from mbkit.studies import exact_motions as exact_motions
 from mbkit.studies.measurement import Problem
-from mbkit.studies.motions import exact as exact_motions
-from mbkit.studies.stress.cases._common import SWING, Facts, Make, case, motion, powers
+from mbkit.studies.stress.case import SWING, Facts, Make, case, motion, powers
 
 _RANGE: Final = (powers(0, 12, 2), (1.0, 1e4, 1e8, 1e12))
 _joint = partial(case, "stiffness", "stiffness", "N m/rad", *_RANGE)

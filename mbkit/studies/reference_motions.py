@@ -19,15 +19,15 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import EPS, Array, real
 from mbkit._escape import one_line
+from mbkit.codegen.backend import Machine
 from mbkit.codegen.extended_precision import Extended, arithmetic
-from mbkit.codegen.interpreter import Machine
 from mbkit.codegen.program import program
 from mbkit.codegen.taylor import PRECISIONS, order_of, precision, taylor_system
 from mbkit.derivation import Equations, equations_of
 from mbkit.derivation.steps.onto_constraints import thorough_projection
 from mbkit.engines import Dynamics, dynamics
+from mbkit.engines.applications.random_states import states_of
 from mbkit.engines.base import at_time
-from mbkit.engines.consistent.random_states import states_of
 from mbkit.engines.registry import DERIVED, INDEPENDENT
 from mbkit.errors import InputError, MbkitError, UnsupportedError
 from mbkit.methods.registry import (
@@ -47,7 +47,7 @@ from mbkit.simulate.solvers.taylor import TaylorSteps
 from mbkit.simulate.solvers.trajectory_record import StoppedError
 from mbkit.simulate.time_grid import save_times
 from mbkit.simulate.torque import Torque, TorqueFunction
-from mbkit.studies.study_runs import Deadline, TooLongError, quiet_simulate
+from mbkit.studies._checkpoint import Deadline, TooLongError, quiet_simulate
 
 # Pairs of runs of one motion: their difference bounds the error of either.
 
@@ -427,7 +427,7 @@ def reference(
     Examples
     --------
     >>> import mbkit as mb
-    >>> from mbkit.studies.motions.reference import reference
+    >>> from mbkit.studies.reference_motions import reference
     >>> truth = reference(mb.catalog.pendulum(), [1.0], [0.0], 2.0, [0.0, 1.0, 2.0])
     >>> truth.horizon
     2.0

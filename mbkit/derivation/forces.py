@@ -6,6 +6,10 @@ frame's its velocity, a bushing's those of its displacement.
 
 A bushing's displacement is the position of one frame in the other and its rotation vector θ, of the rotation by the
 angle |θ| about θ. With w = √(1 + tr R) = 2 cos(|θ|/2), u = vee(R - Rᵀ) / w = 2 sin(|θ|/2) θ/|θ|.
+
+The operations of formulas on CasADi's scalars.
+
+Velocity and acceleration of a motion law, exactly differentiated.
 """
 
 from __future__ import annotations
@@ -17,12 +21,42 @@ from typing import Any, Final, NamedTuple
 import casadi as ca
 
 from mbkit.derivation.body_motion import BodyMotion
-from mbkit.derivation.elements.arithmetic import casadi_arithmetic
 from mbkit.derivation.kinematics import Kinematics, Vector, column, compensation_energies
 from mbkit.derivation.model_values import is_zero, scalar
 from mbkit.model.elements.forces import TIME, Bushing, Force, FrameForce, JointElement, coordinate_arguments
-from mbkit.model.elements.formula import Formula
+from mbkit.model.elements.formula import Arithmetic, Formula
+from mbkit.model.elements.motion_laws import Motion, position
 from mbkit.model.joint_types import dot3
+
+#: Operations of one number, and of two; CasADi calls them so too.
+UNARY: Final = (
+    *("neg", "sq", "twice", "inv", "fabs", "sign", "not", "sqrt", "sin", "cos", "tan", "asin", "acos", "atan"),
+    *("exp", "expm1", "log", "log1p", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
+)
+BINARY: Final = (
+    *("add", "sub", "mul", "div", "pow", "hypot", "atan2", "fmin", "fmax"),
+    *("lt", "le", "eq", "ne", "and", "or", "if_else_zero"),
+)
+
+
+def _unary(code: int) -> Callable[[Any], Any]:
+    return lambda x: scalar(ca.SX.unary(code, ca.SX(x)))
+
+
+def _binary(code: int) -> Callable[[Any, Any], Any]:
+    return lambda a, b: scalar(ca.SX.binary(code, ca.SX(a), ca.SX(b)))
+
+
+_OPERATIONS: Final[dict[str, Callable[..., Any]]] = {
+    **{name: _unary(getattr(ca, f"OP_{name.upper()}")) for name in UNARY},
+    **{name: _binary(getattr(ca, f"OP_{name.upper()}")) for name in BINARY},
+}
+
+
+def casadi_arithmetic(number: Callable[[float], Any] = float) -> Arithmetic:
+    """Return the arithmetic in which `number` stands for the numbers that a formula holds."""
+    return Arithmetic(number, _OPERATIONS)
+
 
 #: Squares of 2 sin(|θ|/2) up to which asin has its series, of which so many terms leave 1e-38.
 _SMALL: Final = 1e-3
@@ -160,3 +194,17 @@ class ElementForces:
                 acting = [x + y for x, y in zip(acting, given, strict=True)]
             total += ca.jtimes(column(port.rates), kin.v, column(acting), True)
         return total
+
+
+def law_rates(motion: Motion) -> Callable[[float], tuple[float, float, float]]:
+    """Return a function of the time, s, that gives a motion's x, ẋ and ẍ at its own numbers."""
+    t = ca.SX.sym("t")
+    x = ca.SX(position(motion, t, casadi_arithmetic()))
+    speed = ca.jacobian(x, t)
+    call = ca.Function("law", [t], [ca.densify(e) for e in (x, speed, ca.jacobian(speed, t))])
+
+    def rates(time: float) -> tuple[float, float, float]:
+        at, first, second = call(time)
+        return float(at), float(first), float(second)
+
+    return rates

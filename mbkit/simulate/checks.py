@@ -22,7 +22,7 @@ from mbkit.methods.registry import ADAPTIVE_METHOD, AUTOMATIC_METHOD, SERIES_MET
 from mbkit.methods.stability import companion
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import magnitude, unit_quaternions
-from mbkit.simulate.diagnostics.stiffness import linearized
+from mbkit.simulate.stiffness_measure import linearized
 
 #: Most times at which the mass matrix and the energy are evaluated.
 CHECKED_TIMES: Final = 7

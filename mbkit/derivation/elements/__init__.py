@@ -1,1 +1,0 @@
-"""Elements given by functions, as CasADi expressions."""

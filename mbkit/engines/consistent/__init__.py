@@ -1,1 +1,0 @@
-"""States and jumps of the velocity that constraints allow."""

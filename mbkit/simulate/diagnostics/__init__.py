@@ -1,1 +1,0 @@
-"""Diagnostics of a run: linearization, eigenvalues, stability of a step, checks."""

@@ -1,1 +1,0 @@
-"""Blocks of fixed steps in machine code, of many states side by side."""

@@ -1,1 +1,0 @@
-"""Motions whose truth is known: exact ones, and references on which two runs agree."""
