@@ -207,6 +207,14 @@ def test_what_a_library_prints_is_no_answer():
     assert dyn.mass_matrix([0.0]).shape == (1, 1)
 
 
+def test_a_kinetic_energy_that_old_bindings_mistake_is_announced(monkeypatch):
+    dyn = mb.dynamics(mb.catalog.pendulum(), present("mujoco", "3.1.0"))
+    monkeypatch.setattr(dyn, "_kinetic_energy", lambda q, v: dyn._potential_energy(q))
+    with pytest.warns(KnownDefectWarning, match="entry of the potential energy is read.*; half"):
+        dyn.kinetic_energy([0.3], [0.2])
+
+
+
 def test_a_process_that_dies_is_an_error_and_the_next_call_starts_another(monkeypatch):
     version = present("mujoco", "4.0.0")
     dyn = mb.dynamics(mb.catalog.pendulum(), version)

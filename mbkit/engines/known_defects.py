@@ -37,7 +37,13 @@ TENDON_ARMATURE: Final = (
     "lagrangian and pinocchio engines have all of a c cᵀ"
 )
 
-#: Pinocchio's of quantities that begin so, for versions in environments of their own.
+ENERGIES: Final = (
+    "known defect of mujoco 3.1.0 to 3.1.3, kinetic_energy: the Python binding's array of energies has stride zero, so "
+    "that the entry of the potential energy is read, which may be zero; half vᵀ M v is right"
+)
+
+#: Of quantities that begin so, for versions in environments of their own.
+OF_MUJOCO: Final = {"kinetic_": ENERGIES}
 OF_PINOCCHIO: Final = {"kinetic_": KINETIC_ENERGY, "coriolis": CORIOLIS}
 
 

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 from mbkit._check import WORLD, real
 from mbkit.engines.frames_and_momenta import TREE
-from mbkit.engines.known_defects import OF_PINOCCHIO
+from mbkit.engines.known_defects import OF_MUJOCO, OF_PINOCCHIO
 from mbkit.engines.remote import environment
 from mbkit.engines.remote.description import NEWTON, ONE_BY_ONE, SENT, SENT_TO_DRAKE, STACKED, Convention, Steps
 from mbkit.errors import InputError, require_known
@@ -96,7 +96,7 @@ _MJX: Final = Package(
 )
 #: Engines with a file of their own in `remote`.
 PACKAGES: Final[dict[str, Package]] = {
-    "mujoco": Package("mujoco", "mujoco", _MUJOCO),
+    "mujoco": Package("mujoco", "mujoco", _MUJOCO, defects=OF_MUJOCO),
     "pinocchio": Package("pin", "pinocchio", Convention(), ONE_BY_ONE, defects=OF_PINOCCHIO),
     "drake": Package(
         *("drake", "pydrake.multibody.plant"),
