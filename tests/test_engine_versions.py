@@ -209,7 +209,7 @@ def test_what_a_library_prints_is_no_answer():
 
 def test_a_kinetic_energy_that_old_bindings_mistake_is_announced(monkeypatch):
     dyn = mb.dynamics(mb.catalog.pendulum(), present("mujoco", "3.1.0"))
-    monkeypatch.setattr(dyn, "_kinetic_energy", lambda q, v: dyn._potential_energy(q))
+    monkeypatch.setattr(dyn, "_kinetic_energy", lambda q, _: dyn._potential_energy(q))
     with pytest.warns(KnownDefectWarning, match="entry of the potential energy is read.*; half"):
         dyn.kinetic_energy([0.3], [0.2])
 
