@@ -214,7 +214,6 @@ def test_a_kinetic_energy_that_old_bindings_mistake_is_announced(monkeypatch):
         dyn.kinetic_energy([0.3], [0.2])
 
 
-
 def test_a_process_that_dies_is_an_error_and_the_next_call_starts_another(monkeypatch):
     version = present("mujoco", "4.0.0")
     dyn = mb.dynamics(mb.catalog.pendulum(), version)
