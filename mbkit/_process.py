@@ -1,4 +1,4 @@
-"""Ctrl-C in a command: one line, status 130, at once.
+"""Ctrl-C in a command: one line, status 130, at once; and locks that a fork waits for.
 
 Python raises KeyboardInterrupt in its main thread after a library call returns, and libraries may swallow, print or
 report it as a failure of their own. So a thread listens too. A command prints one line, is silent from then on, has
@@ -6,8 +6,6 @@ report it as a failure of their own. So a thread listens too. A command prints o
 there the first Ctrl-C is a KeyboardInterrupt, and the second ends the command.
 
 Only light modules of Python are imported here, because the entry point installs this before anything else.
-
-Locks that a fork waits for.
 
 A forked child has the forking thread only. A lock of another thread would stay locked in the child, and its data may be
 half written. A fork therefore takes these locks first, and parent and child release them afterwards.
@@ -21,14 +19,16 @@ import sys
 import threading
 import time
 from itertools import count
-from typing import Any, Final, TypeVar
 from weakref import WeakValueDictionary
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from typing import Any, Final, TypeVar
 
-#: Exit status of an interrupted command.
+    Lock = TypeVar("Lock")
+
+    #: Exit status of an interrupted command.
 INTERRUPTED = 130
 #: Seconds in which an interrupted command may close its files.
 CLOSING_SECONDS = 0.3
@@ -181,8 +181,6 @@ class _Ending:
 #: Around all that the entry point does.
 ending = _Ending()
 
-
-Lock = TypeVar("Lock")
 
 _LOCKS: Final[WeakValueDictionary[int, Any]] = WeakValueDictionary()
 _NUMBERS: Final = count()
