@@ -99,7 +99,7 @@ _HANDED_DOWN = {
     "step_in_phases": "mbkit.simulate.solvers.in_phases.runs",
     "locking": "mbkit.model.changes.locking",
     "sdf": "mbkit.engines.imported",
-    "segments": "mbkit.model.changes.joining",
+    "segments": "mbkit.model.changes.segments",
 }
 hand_down(_HANDED_DOWN)
 

@@ -11,7 +11,7 @@ from click.testing import CliRunner, Result
 
 import mbkit as mb
 from mbkit.cli import cli
-from mbkit.studies._checkpoint import OUT_OF_TIME, InterruptedSweepError
+from mbkit.studies.study_runs import OUT_OF_TIME, InterruptedSweepError
 
 SHORT = ("--engines", "pinocchio,mujoco", "--methods", "rk4,mujoco_rk4", "--quick", "--seconds", "30", "--repeats", "1")
 

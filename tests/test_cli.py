@@ -324,7 +324,7 @@ def test_a_result_that_cannot_be_written_is_still_printed(monkeypatch):
     def full(*_: object, **__: object) -> Path:
         raise OutputError("cannot write there: No space left on device")
 
-    monkeypatch.setattr("mbkit.report.terminal.write", full)
+    monkeypatch.setattr("mbkit.report.output_folder.write", full)
     for more in ((), ("--json",)):
         result = call("check", "pendulum", *QUICK, *more)
         assert result.exit_code == 2

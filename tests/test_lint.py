@@ -17,7 +17,7 @@ import mbkit as mb
 from mbkit.cli import cli
 from mbkit.errors import InputError, LoadError, UnknownNameError, UnsupportedError
 from mbkit.load.shapes import solid as matter_of
-from mbkit.show.mesh_files import solid
+from mbkit.show.meshes import solid
 from mbkit.show.visuals import Shape
 from mbkit.spatial import matrix_from_rpy
 from mbkit.studies.lint import CHECKS, LintResult, checks

@@ -13,10 +13,10 @@ from mbkit.errors import InputError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.parts import Loop, Prescribed
 from mbkit.studies import reference_motions as references
-from mbkit.studies._checkpoint import start_state
 from mbkit.studies.explain import terms
 from mbkit.studies.explain.hypotheses import exchanged
 from mbkit.studies.reference_motions import reference
+from mbkit.studies.study_runs import start_state
 from tests.random_trees import rotation
 from validation import four_bar as bare
 

@@ -18,7 +18,6 @@ from mbkit.engines import dynamics
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.simulate import simulate
 from mbkit.studies import reference_motions as module
-from mbkit.studies._checkpoint import Deadline, TooLongError
 from mbkit.studies.reference_motions import (
     checked_motion,
     gap,
@@ -26,6 +25,7 @@ from mbkit.studies.reference_motions import (
     taylor_pair,
     two_engines,
 )
+from mbkit.studies.study_runs import Deadline, TooLongError
 from tests.scenes import mounted
 
 hy = pytest.importorskip("heyoka")

@@ -16,7 +16,7 @@ from mbkit._escape import one_line, terminal
 from mbkit.errors import OutputError
 from mbkit.report import page as pages
 from mbkit.report import terminal as tables
-from mbkit.report.terminal import check_writable, file_stem, write
+from mbkit.report.output_folder import check_writable, file_stem, write
 from mbkit.simulate.progress import Bar
 from mbkit.studies.compare import figure
 from mbkit.studies.compare.all_robots import RobotOutcome, Sweep

@@ -23,8 +23,8 @@ import mbkit as mb
 from mbkit.errors import InputError, MbkitWarning, OutputError, UnsupportedError
 from mbkit.load import shapes as solids
 from mbkit.model.description import body_poses
-from mbkit.show import Scene, mesh_files, shapes_of, view
-from mbkit.show.mesh_files import _by_coal, read_surfaces, solid, thinned
+from mbkit.show import Scene, meshes, shapes_of, view
+from mbkit.show.meshes import _by_coal, read_surfaces, solid, thinned
 from tests.random_trees import IN_MUJOCO, random_tree
 
 EPS = np.finfo(float).eps
@@ -279,7 +279,7 @@ def test_colours_are_numbers_from_pictures_that_fit(tmp_path: Path, monkeypatch)
     os.close(pipe)
     (tmp_path / "b.dae").write_text(DAE.replace("<color>1", "<color>inf"))
     assert read_surfaces(tmp_path / "b.dae")[0].color is None
-    monkeypatch.setattr(mesh_files, "_MAX_TEXTURE_PIXELS", 15)
+    monkeypatch.setattr(meshes, "_MAX_TEXTURE_PIXELS", 15)
     (tmp_path / "a.dae").write_text(text.replace("pipe.png", "a.png"))
     assert read_surfaces(tmp_path / "a.dae")[0].color is None
     (tmp_path / "a.obj").write_text(OBJ + "".join(f"usemtl {k}\nf 1 2 3\n" for k in range(5000)))

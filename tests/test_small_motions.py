@@ -9,7 +9,7 @@ import sympy as sp
 
 import mbkit as mb
 from mbkit.lagrangian import Lagrangian
-from mbkit.methods.stability import definite, eigenvalues, small_motion
+from mbkit.methods.small_motions import definite, eigenvalues, small_motion
 
 x, y, z, u, v, w = sp.symbols("x y z u v w")
 EPS = np.finfo(float).eps

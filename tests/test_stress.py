@@ -26,7 +26,6 @@ from mbkit._child_process import WorkerDiedError, WorkerTimeoutError
 from mbkit.cli import cli
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.studies import InterruptedSweepError, StressResult
-from mbkit.studies._checkpoint import OUT_OF_TIME
 from mbkit.studies.stress import Case, CaseResult, Measurement, Problem, Row, stress
 from mbkit.studies.stress.case import problem_of
 from mbkit.studies.stress.measurements import (
@@ -38,6 +37,7 @@ from mbkit.studies.stress.measurements import (
     reference_motion,
 )
 from mbkit.studies.stress.study import CaseSweep
+from mbkit.studies.study_runs import OUT_OF_TIME
 from tests import stress_cases as own
 
 METHODS = ("rk4", *own.ENDS)

@@ -12,7 +12,7 @@ from mbkit.errors import InputError, NumericalError, UnknownNameError
 from mbkit.lagrangian import Lagrangian
 from mbkit.lagrangian.statics.equilibrium import equilibrium
 from mbkit.lagrangian.statics.virtual_work import from_particles, generalized_force
-from mbkit.methods.stability import small_motion
+from mbkit.methods.small_motions import small_motion
 
 th, w, r, vr, x, y, vx, vy = sp.symbols("theta omega r v_r x y vx vy")
 m, ell, g, k, c, t, Om, R, a, F = sp.symbols("m l g k c t Omega R a F")

@@ -408,7 +408,7 @@ def test_what_was_finished_is_kept_upon_an_interruption(calls, tmp_path, few):
 
 
 def test_a_checkpoint_gets_results_on_the_way_and_the_last(monkeypatch):
-    monkeypatch.setattr("mbkit.studies._checkpoint._SECONDS_BETWEEN_RESULTS", 0.0)
+    monkeypatch.setattr("mbkit.studies.study_runs._SECONDS_BETWEEN_RESULTS", 0.0)
     got = []
     result = study(["pinocchio"], ["rk4"], checkpoint=got.append)
     assert [r.complete for r in got] == [False] * (len(got) - 1) + [True]

@@ -25,8 +25,8 @@ import numpy as np
 import mbkit as mb
 from mbkit.methods.registry import METHODS
 from mbkit.simulate.solvers.auto import EXPLICIT, IMPLICIT
-from mbkit.studies._checkpoint import start_state
 from mbkit.studies.stress.cases import CASES
+from mbkit.studies.study_runs import start_state
 from validation.stamp import results, stamp
 
 GOAL, RTOL = 1e-6, 1e-8

@@ -34,7 +34,7 @@ import mbkit as mb
 from mbkit.model.integration_space import Space
 from mbkit.simulate.solvers.compiled_fixed_step import Chunk
 from mbkit.simulate.time_grid import Grid
-from mbkit.studies._checkpoint import start_state
+from mbkit.studies.study_runs import start_state
 from validation.stamp import results, stamp
 
 ROUNDS, GOAL, TIMES = 9, 1e-9, 10

@@ -37,9 +37,9 @@ from mbkit._check import by_key
 from mbkit.engines.remote import process
 from mbkit.errors import MbkitError, MbkitWarning
 from mbkit.load.sanitized_text import strip
-from mbkit.studies._checkpoint import free_of_mimic, start_state
 from mbkit.studies.compare.terms import states
 from mbkit.studies.results import to_plain
+from mbkit.studies.study_runs import free_of_mimic, start_state
 from tests.random_trees import random_tree
 from validation.arms import joint, link, urdf, written
 from validation.own_parser import OwnParser

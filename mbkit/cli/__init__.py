@@ -13,7 +13,7 @@ import sys
 import click
 
 from mbkit._version import __version__
-from mbkit.cli import baseline, bench, check, derive, diff, simulate
+from mbkit.cli import baseline, bench_and_stress, check_and_lint, derive, descriptions, simulate_and_plot
 from mbkit.cli._shared import CommandGroup
 
 
@@ -33,17 +33,9 @@ def cli() -> None:
 
 
 for _command in (
-    *(
-        check.check,
-        check.lint,
-        diff.diff,
-        baseline.baseline,
-        derive.derive,
-        derive.export,
-        simulate.simulate,
-        simulate.plot,
-    ),
-    *(bench.bench, bench.stress, diff.convert, diff.robots),
+    *(check_and_lint.check, check_and_lint.lint, descriptions.diff, baseline.baseline, derive.derive, derive.export),
+    *(simulate_and_plot.simulate, simulate_and_plot.plot, bench_and_stress.bench, bench_and_stress.stress),
+    *(descriptions.convert, descriptions.robots),
 ):
     cli.add_command(_command)
 

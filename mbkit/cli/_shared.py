@@ -122,7 +122,7 @@ def load_options(command: Command) -> Command:
 def stem_of(target: str, name: str) -> str:
     """Return the stem of a target's files: the robot's name or the file's path, since several files hold one name."""
     from mbkit.load.loader import canonical
-    from mbkit.report.terminal import file_stem
+    from mbkit.report.output_folder import file_stem
 
     if (robot := canonical(target)) is None and Path(target).is_file():
         # The end of a path tells more than its beginning.
@@ -281,10 +281,10 @@ class Report:
 
     def prepare(self, stem: str = "", *endings: str) -> None:
         """Raise before anything is computed if a result could not be written."""
-        from mbkit.report import terminal
+        from mbkit.report import output_folder
 
-        terminal.check_writable(self.out)
-        terminal.check_replaceable(self.out, *(f"{stem}.{ending}" for ending in endings), force=self.force)
+        output_folder.check_writable(self.out)
+        output_folder.check_replaceable(self.out, *(f"{stem}.{ending}" for ending in endings), force=self.force)
 
     def write(
         self,
@@ -294,7 +294,7 @@ class Report:
         figure: Callable[[], bytes] | None = None,
     ) -> bool:
         """Write JSON, CSV (`table`), PNG (`figure`) and a page of a result, and print it; return whether all went."""
-        from mbkit.report import terminal
+        from mbkit.report import output_folder
         from mbkit.report.page import render
 
         def page() -> str:
@@ -311,7 +311,7 @@ class Report:
         try:
             for what, (ending, content) in contents.items():
                 if content is not None:
-                    paths[what] = terminal.write(self.out, f"{stem}.{ending}", content(), force=self.force)
+                    paths[what] = output_folder.write(self.out, f"{stem}.{ending}", content(), force=self.force)
         except OutputError as error:
             failure = str(error)
         try:

@@ -196,7 +196,7 @@ def _check_target(files: list[Path], target: str | None, options: dict[str, Any]
 def _name(target: str) -> str:
     """Return what a target's file is called in a folder: as the robot, the file or the function."""
     from mbkit.load.loader import canonical
-    from mbkit.report.terminal import file_stem
+    from mbkit.report.output_folder import file_stem
 
     robot = canonical(target)
     path = robot is None and (Path(target).is_file() or "/" in target)

@@ -73,12 +73,12 @@ def derive(
         raise click.UsageError("--json and --program exclude each other; --program has --python, --latex and --c")
     if as_json and form:
         raise click.UsageError(f"--json and --{form} exclude each other: the JSON holds the equations in both forms")
-    from mbkit.report.terminal import check_writable, write
+    from mbkit.report.output_folder import check_writable, write
 
     if out is not None:
         check_writable(out)
     target = _model(system, options)
-    from mbkit.lagrangian.energies.symbols import chart_names
+    from mbkit.lagrangian.energies.charts import chart_names
     from mbkit.lagrangian.energy_model import EnergyModel
     from mbkit.lagrangian.from_description import from_model
     from mbkit.lagrangian.summary import in_symbols, letters

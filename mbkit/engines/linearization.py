@@ -27,7 +27,7 @@ from mbkit.engines.evaluation import Evaluation
 from mbkit.engines.steps import Slopes, differentiable_method, step_derivatives
 from mbkit.errors import InputError, NumericalError, UnsupportedError, require_known
 from mbkit.methods.registry import DEFAULT_METHOD, Method
-from mbkit.methods.stability import graded
+from mbkit.methods.small_motions import graded
 from mbkit.model import Model
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.quantities import QUANTITIES, of_groups

@@ -29,15 +29,15 @@ if TYPE_CHECKING:
     from mbkit.lagrangian.reduction.hamilton import CanonicalEquations as CanonicalEquations
     from mbkit.lagrangian.reduction.hamilton import ConservedQuantity as ConservedQuantity
     from mbkit.lagrangian.reduction.hamilton import Hamiltonian as Hamiltonian
+    from mbkit.lagrangian.reduction.impulses import ImpulseEquations as ImpulseEquations
     from mbkit.lagrangian.reduction.nonholonomic import Integrability as Integrability
     from mbkit.lagrangian.reduction.nonholonomic import NonholonomicEquations as NonholonomicEquations
-    from mbkit.lagrangian.reduction.quasi_equations import ImpulseEquations as ImpulseEquations
     from mbkit.lagrangian.reduction.quasi_equations import QuasiEquationsOfMotion as QuasiEquationsOfMotion
     from mbkit.lagrangian.reduction.routh import Routhian as Routhian
     from mbkit.lagrangian.statics.equilibrium import Equilibrium as Equilibrium
-    from mbkit.lagrangian.statics.equilibrium import portrait as portrait
     from mbkit.lagrangian.statics.newton_euler import FreeBodies as FreeBodies
     from mbkit.lagrangian.statics.newton_euler import newton_euler as newton_euler
+    from mbkit.lagrangian.statics.portrait import portrait as portrait
     from mbkit.lagrangian.statics.virtual_work import from_particles as from_particles
     from mbkit.lagrangian.statics.virtual_work import generalized_force as generalized_force
     from mbkit.lagrangian.system import Lagrangian as Lagrangian
@@ -53,11 +53,13 @@ _NAMES = {
     "independent_coordinates": "Embedded",
     "program_text": "ProgramText program",
     "reduction.hamilton": "CanonicalEquations ConservedQuantity Hamiltonian",
+    "reduction.impulses": "ImpulseEquations",
     "reduction.nonholonomic": "Integrability NonholonomicEquations",
-    "reduction.quasi_equations": "ImpulseEquations QuasiEquationsOfMotion",
+    "reduction.quasi_equations": "QuasiEquationsOfMotion",
     "reduction.routh": "Routhian",
-    "statics.equilibrium": "Equilibrium portrait",
+    "statics.equilibrium": "Equilibrium",
     "statics.newton_euler": "FreeBodies newton_euler",
+    "statics.portrait": "portrait",
     "statics.virtual_work": "from_particles generalized_force",
     "system": "Lagrangian QuasiLagrangian",
 }

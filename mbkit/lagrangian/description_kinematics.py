@@ -18,9 +18,10 @@ from mbkit._reproducible import DEPENDENT, pivoted
 from mbkit.derivation.kinematics import Kinematics, compensation_energies, gravity_energy, kinetic_energy
 from mbkit.derivation.model_values import Values
 from mbkit.errors import InputError
+from mbkit.lagrangian.energies.charts import angle_rates, quaternion, turning
 from mbkit.lagrangian.energies.energy_form import QuasiVelocities
 from mbkit.lagrangian.energies.kinetic_energy import inverse
-from mbkit.lagrangian.energies.symbols import angle_rates, quaternion, turning, velocity_of
+from mbkit.lagrangian.energies.symbols import velocity_of
 from mbkit.lagrangian.trig.shortest_form import Key, TrigPolynomial, TrigRing, number, shortest_form
 from mbkit.lagrangian.trig.simplify import tidy
 from mbkit.model import Joint, Model, NoSlip

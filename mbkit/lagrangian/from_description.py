@@ -13,7 +13,7 @@ from mbkit.derivation.kinematics import dissipation, jump_rates, spring_energy
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError, warn
 from mbkit.lagrangian.description_kinematics import INSTEAD_OF_WRITING, SymbolicKinematics, exact, written_rows
 from mbkit.lagrangian.elements import acting, law
-from mbkit.lagrangian.energies.symbols import chart_names, chart_velocities
+from mbkit.lagrangian.energies.charts import chart_names, chart_velocities
 from mbkit.lagrangian.energy_model import EnergyModel
 from mbkit.lagrangian.summary import in_symbols
 from mbkit.lagrangian.system import Lagrangian, QuasiLagrangian

@@ -24,8 +24,8 @@ from mbkit._check import ROUNDING
 from mbkit._escape import identifier, one_line, python_docstring
 from mbkit._version import __version__
 from mbkit.errors import MbkitError
+from mbkit.lagrangian.energies.charts import chart_names
 from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, equations_of_motion, printed_equations
-from mbkit.lagrangian.energies.symbols import chart_names
 from mbkit.lagrangian.printer import Abbreviations, ExpressionPrinter, folded, matrix, spread, written
 from mbkit.lagrangian.reduction.quasi_equations import QuasiEquationsOfMotion
 from mbkit.lagrangian.system import Lagrangian

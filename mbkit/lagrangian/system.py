@@ -31,6 +31,7 @@ from mbkit.lagrangian.energy_model import EnergyModel, energies_latex
 from mbkit.lagrangian.independent_coordinates import Embedded
 from mbkit.lagrangian.reduction import hamilton
 from mbkit.lagrangian.reduction.hamilton import ConservedQuantity, Hamiltonian, hamiltonian
+from mbkit.lagrangian.reduction.impulses import ImpulseEquations, impulse_equations
 from mbkit.lagrangian.reduction.nonholonomic import (
     Integrability,
     NonholonomicEquations,
@@ -39,12 +40,7 @@ from mbkit.lagrangian.reduction.nonholonomic import (
     require_value,
     symmetry_momenta,
 )
-from mbkit.lagrangian.reduction.quasi_equations import (
-    ImpulseEquations,
-    impulse_equations,
-    in_quasi_velocities,
-    quasi_equations,
-)
+from mbkit.lagrangian.reduction.quasi_equations import in_quasi_velocities, quasi_equations
 from mbkit.lagrangian.reduction.routh import Routhian, routhian
 from mbkit.lagrangian.trig.simplify import tidy
 

@@ -1,15 +1,8 @@
-"""Documents on a terminal: the verdict first, then where it comes from.
-
-The folder that pages and data are written to.
-"""
+"""Documents on a terminal: the verdict first, then where it comes from."""
 
 from __future__ import annotations
 
-import json
-import os
-import re
 from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
 from typing import Any, Final
 
 from rich import box
@@ -18,12 +11,9 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from mbkit import _process as _interrupt
 from mbkit._escape import one_line, terminal
-from mbkit.errors import OutputError, writing
 from mbkit.studies import document
 from mbkit.studies.document import Bullet, Column, Document, Items, Paragraph, Span, Style
-from mbkit.studies.results import write_whole
 
 _STYLES: Final[dict[Style, str]] = {
     "good": "green",
@@ -122,66 +112,3 @@ def robots(records: Sequence[Any], systems: Iterable[str]) -> RenderableType:
     head = f"{len(records)} robots of example-robot-data; mimic joints reduced."
     foot = f"{head} Catalog systems: {', '.join(systems)}"
     return Group(table(document.Table(columns, records)), Padding(Text(foot, style="dim"), (0, 0, 1, 0)))
-
-
-def file_stem(name: str) -> str:
-    """Return a model's name as the stem of a file in the folder, whatever the name holds."""
-    return re.sub(r"[^\w.+-]+", "_", name).strip("._")[:100] or "model"
-
-
-def check_writable(folder: Path) -> None:
-    """Raise `OutputError`, before long work, if `folder` cannot be written to; nothing is created."""
-    place = folder.absolute()
-    while not place.exists() and place != place.parent:
-        place = place.parent
-    why = "" if os.access(place, os.W_OK | os.X_OK) else f"no permission in {place}"
-    why = why if place.is_dir() else f"{place} is not a folder"
-    if why:
-        raise OutputError(f"cannot write to {folder}: {why}; choose another with --out")
-
-
-def check_replaceable(folder: Path, *names: str, force: bool = False) -> None:
-    """Raise `OutputError`, before long work, for a file that mbkit did not write, unless `force` is set."""
-    for path in (folder / name for name in names):
-        if not force and os.path.lexists(path) and not _is_own(path):
-            remedy = "choose another folder with --out, or replace it with --force"
-            raise OutputError(f"{path} is there and mbkit did not write it; {remedy}")
-
-
-#: At the beginning or the end of what mbkit writes.
-_MARKS: Final = (
-    b'content="mbkit"',
-    b"Software\0mbkit",
-    b"ritten by mbkit",
-    b"engine,method,setting,value,",
-    b"case,parameter,unit,value,engine,method,",
-    b"t,q.",
-)
-_HEAD_BYTES: Final = 4096
-
-
-def _is_own(path: Path) -> bool:
-    """Return whether a file is one that a command of mbkit has written."""
-    try:
-        if path.suffix == ".json":
-            data = json.loads(path.read_bytes())
-            # Equations say at their head with which mbkit they were written; results among other versions.
-            return isinstance(data, dict) and "mbkit" in (data | dict(data.get("versions") or {}))
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
-            file.seek(max(0, os.path.getsize(path) - 64))
-            head += file.read()
-    except (OSError, ValueError, TypeError, RecursionError):
-        return False
-    return any(mark in head for mark in _MARKS)
-
-
-def write(folder: Path, name: str, content: str | bytes, *, force: bool = False) -> Path:
-    """Write a file as a whole or not at all, text as UTF-8, and return its path; see `check_replaceable`."""
-    path = folder / name
-    with _interrupt.uninterrupted:
-        check_replaceable(folder, name, force=force)
-        with writing(path, "choose another folder with --out"):
-            folder.mkdir(parents=True, exist_ok=True)
-            write_whole(path, content if isinstance(content, bytes) else content.encode("utf-8", "backslashreplace"))
-    return path

@@ -16,7 +16,7 @@ from mbkit.model import Body, Model
 from mbkit.model.description import body_poses, inertia_box
 from mbkit.model.elements.paths import OF_BODIES, Path
 from mbkit.model.validation import listing
-from mbkit.show.mesh_files import Color, thinned
+from mbkit.show.meshes import Color, thinned
 from mbkit.show.visuals import Shape, Visuals, read_visuals
 
 PICTURE: Final = Path(

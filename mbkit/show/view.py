@@ -37,7 +37,7 @@ from mbkit.load import load
 from mbkit.model import Model
 from mbkit.model.elements.formula import NUMPY
 from mbkit.model.elements.motion_laws import motions_of, position
-from mbkit.show.mesh_files import Surface
+from mbkit.show.meshes import Surface
 from mbkit.show.scene import HALF_ANGLE_DEGREES, PICTURE, Kind, Scene, camera_axes
 
 #: Suffix -> Matplotlib's writer, and what to install where it is missing.

@@ -28,7 +28,7 @@ from mbkit.load.shapes import SIZES
 from mbkit.load.xml_reader import Element, Reader, element_text
 from mbkit.model import Frame, Model
 from mbkit.model.description import ShapeFile
-from mbkit.show.mesh_files import Color, Surface, cleaned, file_of, read_surfaces, solid
+from mbkit.show.meshes import Color, Surface, cleaned, file_of, read_surfaces, solid
 
 GREY: Final[Color] = (0.70, 0.72, 0.75, 1.0)
 #: Groups of MJCF's geoms that MuJoCo's viewer shows without being asked.

@@ -23,7 +23,7 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.base import at_time, no_dynamics
 from mbkit.engines.registry import DERIVED
 from mbkit.errors import InputError, NumericalError
-from mbkit.methods.stability import graded
+from mbkit.methods.small_motions import graded
 from mbkit.model import Model
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import tangent_maps, unit_quaternions

@@ -47,7 +47,7 @@ from mbkit.simulate.solvers.taylor import TaylorSteps
 from mbkit.simulate.solvers.trajectory_record import StoppedError
 from mbkit.simulate.time_grid import save_times
 from mbkit.simulate.torque import Torque, TorqueFunction
-from mbkit.studies._checkpoint import Deadline, TooLongError, quiet_simulate
+from mbkit.studies.study_runs import Deadline, TooLongError, quiet_simulate
 
 # Pairs of runs of one motion: their difference bounds the error of either.
 

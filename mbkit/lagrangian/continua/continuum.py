@@ -12,7 +12,7 @@ from sympy.core.function import AppliedUndef
 
 from mbkit._escape import one_line, terminal
 from mbkit.lagrangian.continua.densities import Densities
-from mbkit.lagrangian.continua.integrals import Jets
+from mbkit.lagrangian.continua.jets import Jets
 from mbkit.lagrangian.continua.ritz import AssumedModes, NormalModes, assumed_modes, normal_modes
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned
 from mbkit.lagrangian.trig.simplify import tidy

@@ -13,7 +13,8 @@ import mpmath
 import sympy as sp
 
 from mbkit.errors import InputError, UnsupportedError
-from mbkit.lagrangian.continua.integrals import INTEGRAL_DIGITS, Integrals, Jets, Shape, number, weights_of
+from mbkit.lagrangian.continua.integrals import INTEGRAL_DIGITS, Integrals, Shape, number, weights_of
+from mbkit.lagrangian.continua.jets import Jets
 from mbkit.lagrangian.energies.symbols import expression, listed, velocity_of
 
 

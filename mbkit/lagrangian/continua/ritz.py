@@ -21,7 +21,8 @@ from mbkit._check import count as counted
 from mbkit._escape import one_line
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.lagrangian.continua.densities import Densities, Reduction, terms
-from mbkit.lagrangian.continua.integrals import MAX_MODES, Integrals, Order, Shape, read_shape, weights_of
+from mbkit.lagrangian.continua.integrals import MAX_MODES, Integrals, Shape, read_shape, weights_of
+from mbkit.lagrangian.continua.jets import Order
 from mbkit.lagrangian.energies.symbols import listed, name_of, plain, velocity_of
 
 #: A number for each power of ξ.

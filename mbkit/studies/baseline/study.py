@@ -36,7 +36,6 @@ from mbkit.methods.registry import DEFAULT_METHOD
 from mbkit.model import Model
 from mbkit.model.validation import listing
 from mbkit.studies import results
-from mbkit.studies._checkpoint import Progress, quiet_simulate, require_motion, silent
 from mbkit.studies._targets import checked_target, engine_names, with_values
 from mbkit.studies.baseline import description, file
 from mbkit.studies.baseline.description import Change, changes, described, links_of, moving_mass, without_consequences
@@ -46,6 +45,7 @@ from mbkit.studies.compare.errors import Errors, Scales
 from mbkit.studies.compare.terms import TERMS, States, states
 from mbkit.studies.explain.hypotheses import turn_of
 from mbkit.studies.results import Refusal
+from mbkit.studies.study_runs import Progress, quiet_simulate, require_motion, silent
 
 FINE: Final = 8.0 * EPS
 ROUNDING: Final = 1e-9

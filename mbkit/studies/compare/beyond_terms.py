@@ -28,10 +28,10 @@ from mbkit.model.description import LEFT_OUT, SERVOS
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.parts import Joint, rules_of
 from mbkit.simulate import Trajectory
-from mbkit.studies._checkpoint import quiet_simulate, start_state, state_within_limits
 from mbkit.studies.compare.errors import ROUNDINGS, interleaved
 from mbkit.studies.compare.terms import ACTUATORS, LIMITS, STIFF, Finding, Omission, RolloutRow
 from mbkit.studies.results import counted
+from mbkit.studies.study_runs import quiet_simulate, start_state, state_within_limits
 
 #: The step of the rollouts, s.
 STEP: Final = 1e-3

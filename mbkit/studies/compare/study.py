@@ -30,7 +30,6 @@ from mbkit.errors import KnownDefectWarning, MbkitError, NumericalError, Unsuppo
 from mbkit.model import Model
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.studies import results
-from mbkit.studies._checkpoint import Progress, integrable, require_motion, silent
 from mbkit.studies._targets import engine_names, with_values
 from mbkit.studies.compare.beyond_terms import findings, omissions, rollouts
 from mbkit.studies.compare.body_terms import BODY_TERMS, MECHANISM_TERMS, BodyScales
@@ -58,6 +57,7 @@ from mbkit.studies.compare.terms import (
     states,
 )
 from mbkit.studies.results import Refusal, model_info
+from mbkit.studies.study_runs import Progress, integrable, require_motion, silent
 from mbkit.studies.work_precision.study import work_precision
 
 _SEEDS: Final = (0, 1)

@@ -43,7 +43,6 @@ from mbkit.model.elements.references import hung_on
 from mbkit.model.model import unchecked
 from mbkit.model.validation import listing
 from mbkit.studies import results
-from mbkit.studies._checkpoint import free_of_mimic
 from mbkit.studies.compare.terms import States
 from mbkit.studies.explain.hypotheses import exchanged, follows, moved, paired
 from mbkit.studies.explain.merged_model import Tolerances
@@ -51,6 +50,7 @@ from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
 from mbkit.studies.explain.terms import TERMS, Gap, Gaps, Values, effects, gaps, model_terms, states_of, worst
 from mbkit.studies.importers.result import FILE, MISSING, Parsed, ParserComparison, Stage
+from mbkit.studies.study_runs import free_of_mimic
 from mbkit.studies.worker import Worker, describe
 
 #: Attributes that switch equalities off, by element.

@@ -24,7 +24,7 @@ from mbkit.engines import Dynamics
 from mbkit.load.shapes import MassProperties
 from mbkit.model import Body, Model
 from mbkit.model.validation import body_fault, listing
-from mbkit.show.mesh_files import Indices
+from mbkit.show.meshes import Indices
 from mbkit.show.visuals import Shape
 from mbkit.spatial import skew
 from mbkit.studies.compare.beyond_terms import stiff_joints

@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, real
 from mbkit.errors import InputError
 from mbkit.model import Model
-from mbkit.studies._checkpoint import whole_steps
 from mbkit.studies.exact_motions import Exact
 from mbkit.studies.measurement import Problem
+from mbkit.studies.study_runs import whole_steps
 
 #: Families stand in the order of a study: stiff ones first, those that take longest last.
 Family = Literal["stiffness", "mass ratio", "length", "spin", "near-singular", "friction", "large", "step", "long"]

@@ -26,13 +26,13 @@ from mbkit.methods.registry import ADAPTIVE_METHOD, AUTOMATIC_METHOD, METHODS, S
 from mbkit.model import Model
 from mbkit.simulate import Trajectory, simulate
 from mbkit.simulate.plotting.style import engine_index
-from mbkit.studies._checkpoint import Deadline, TooLongError, heard_warnings, quiet_simulate
 from mbkit.studies.compare.errors import Scales, interleaved
 from mbkit.studies.compare.terms import FORWARD_DYNAMICS, States
 from mbkit.studies.compare.terms import TERMS as COMPARED
 from mbkit.studies.measurement import MAX_ERROR, Measurement, Outcome, Problem, Truth, run_name
 from mbkit.studies.reference_motions import reference
 from mbkit.studies.stress.case import Case, problem_of, step_of, times_of
+from mbkit.studies.study_runs import Deadline, TooLongError, heard_warnings, quiet_simulate
 from mbkit.studies.worker import report_stage
 
 #: The engines on which mbkit recommends its automatic method.

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 from mbkit._check import real
 from mbkit.errors import require_known
 from mbkit.studies import document as doc
-from mbkit.studies._checkpoint import OUT_OF_TIME
 from mbkit.studies.document import Bullet, Column, Document, Items, Paragraph, Section, Span, Table
 from mbkit.studies.formatting import setting_words, time_text
 from mbkit.studies.measurement import Measurement, Outcome
 from mbkit.studies.results import NO_LIMIT, ResultTable, columns, counted
 from mbkit.studies.stress.figure import WORDS, cell_text, figure, number_text, shade
 from mbkit.studies.stress.measurements import UNKNOWN, Breaking, CaseResult, Line, Row
+from mbkit.studies.study_runs import OUT_OF_TIME
 from mbkit.studies.svg import PAGE, page_style, svg
 
 if TYPE_CHECKING:

@@ -28,12 +28,12 @@ from mbkit.engines.registry import DERIVED, INDEPENDENT, find_engine
 from mbkit.errors import InputError
 from mbkit.methods.registry import METHODS
 from mbkit.studies import results
-from mbkit.studies._checkpoint import OUT_OF_TIME, Checkpoint, Checkpointer, Progress, TooLongError
 from mbkit.studies._targets import methods_by_engine, numbers_of
 from mbkit.studies.measurement import BAR, End, Measurement
 from mbkit.studies.stress.case import Case
 from mbkit.studies.stress.measurements import TERMS, CaseResult, Limits, Prepared, Row, measure, prepare
 from mbkit.studies.stress.result import StressResult
+from mbkit.studies.study_runs import OUT_OF_TIME, Checkpoint, Checkpointer, Progress, TooLongError
 from mbkit.studies.worker import CallError, Worker, WorkerPool, check_executor, check_sendable, describe, in_worker, run
 
 #: Seconds of a run and of the whole study, quick and not.

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 
 from mbkit._check import by_key
 from mbkit.studies import document as doc
-from mbkit.studies._checkpoint import OUT_OF_TIME
 from mbkit.studies.formatting import count_text, error_text, missing_text, model_facts, setting_words, time_text
 from mbkit.studies.measurement import Measurement
 from mbkit.studies.results import Refusal, ResultTable, columns, counted
+from mbkit.studies.study_runs import OUT_OF_TIME
 from mbkit.studies.svg import PAGE, image, page_style, svg
 from mbkit.studies.work_precision.figure import MAX_USEFUL_ERROR, figure
 from mbkit.studies.work_precision.sweep import Curve, pareto_front

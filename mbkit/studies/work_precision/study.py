@@ -17,11 +17,11 @@ from mbkit.methods.registry import METHODS
 from mbkit.model import Model
 from mbkit.simulate.torque import TorqueFunction
 from mbkit.studies import results
-from mbkit.studies._checkpoint import Checkpoint, Checkpointer, Progress, integrable, require_motion, start_state
 from mbkit.studies._targets import methods_by_engine, numbers_of, with_values
 from mbkit.studies.measurement import Problem, Truth, farthest
 from mbkit.studies.reference_motions import Reference
 from mbkit.studies.reference_motions import reference as compute_reference
+from mbkit.studies.study_runs import Checkpoint, Checkpointer, Progress, integrable, require_motion, start_state
 from mbkit.studies.work_precision.result import WorkPrecision
 from mbkit.studies.work_precision.sweep import INTERVALS, Sweep, TimeBudget, plans
 from mbkit.studies.worker import check_executor

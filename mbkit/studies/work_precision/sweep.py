@@ -30,9 +30,9 @@ from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.methods.registry import METHODS, Method, method_of
 from mbkit.model import Model
 from mbkit.simulate import Trajectory
-from mbkit.studies._checkpoint import OUT_OF_TIME, Deadline, TooLongError, quiet_simulate, whole_steps
 from mbkit.studies.measurement import Measurement, Problem, Truth, farthest, run_name
 from mbkit.studies.results import Refusal
+from mbkit.studies.study_runs import OUT_OF_TIME, Deadline, TooLongError, quiet_simulate, whole_steps
 from mbkit.studies.worker import run
 
 T = TypeVar("T")

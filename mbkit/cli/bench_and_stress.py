@@ -1,7 +1,4 @@
-"""`mbkit bench`: which engine and method reaches which error in which time.
-
-`mbkit stress`: where each engine and method breaks.
-"""
+"""`mbkit bench`: which method reaches which error in which time; `mbkit stress`: where each one breaks."""
 
 from __future__ import annotations
 
@@ -59,8 +56,8 @@ def bench(
     from mbkit.methods.registry import METHODS, QUICK_METHODS
     from mbkit.simulate.progress import Bar
     from mbkit.studies import work_precision
-    from mbkit.studies._checkpoint import InterruptedSweepError
     from mbkit.studies._targets import model_of
+    from mbkit.studies.study_runs import InterruptedSweepError
     from mbkit.studies.work_precision.result import picture
     from mbkit.studies.worker import WorkerPool
 
@@ -127,8 +124,8 @@ def stress(
         _list(as_json=report.as_json)
         return
     from mbkit.simulate.progress import Bar
-    from mbkit.studies._checkpoint import InterruptedSweepError
     from mbkit.studies.stress.study import stress as study
+    from mbkit.studies.study_runs import InterruptedSweepError
 
     shared.check_engines(engines, least=1)
     # One case has files of its own; several share theirs.

@@ -1,12 +1,12 @@
-"""Meshes from files: OBJ and COLLADA with the colours of their materials, all else by Assimp in Pinocchio's coal.
+"""Triangles of what is drawn: round shapes, boxes, and meshes from files.
+
+OBJ and COLLADA are read with the colours of their materials, all else by Assimp in Pinocchio's coal.
 
 coal makes one surface of a file and drops its materials, so the two formats that have any are read here. coal 3.0.3
 also gives the triangles of a node's second mesh the vertices of the first one, and each material is a mesh there. Files
 are those of strangers: whatever is wrong with one is a ValueError. That is why pycollada 0.9.3 and trimesh 5.2.0 do not
 read them: a mesh without one of its materials gets lost (of 343 public meshes the foot of ANYmal, with all its 4,604
 triangles), NaN becomes zero, a wrong index an empty mesh, and trimesh rounds colours to bytes.
-
-Triangles of the shapes that are drawn: solids of revolution, boxes, and meshes with fewer triangles.
 """
 
 from __future__ import annotations

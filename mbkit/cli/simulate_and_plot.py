@@ -1,7 +1,4 @@
-"""`mbkit simulate`: a motion from the command line, as a table and figures.
-
-`mbkit plot`: figures of the files that other commands wrote.
-"""
+"""`mbkit simulate`: a motion as a table and figures; `mbkit plot`: figures of files that commands wrote."""
 
 from __future__ import annotations
 
@@ -97,7 +94,7 @@ def _state(option: str, text: str, model: Model, which: int) -> Any:
 
 
 def _write(run: Trajectory, report: Report, stem: str) -> list[str]:
-    from mbkit.report.terminal import write
+    from mbkit.report.output_folder import write
     from mbkit.studies.svg import image
 
     contents: dict[str, Any] = {"trajectory.csv": run.to_csv, "plot.png": lambda: image(run.plot())}
@@ -142,7 +139,7 @@ def plot(files: tuple[Path, ...], case: str | None, ending: str, out: Path | Non
     FILE is the CSV of mbkit simulate, or the JSON of mbkit check, mbkit bench or mbkit stress. The figure has the
     file's name. Exit status: 0 done, 2 misuse or bad input.
     """
-    from mbkit.report.terminal import check_replaceable, check_writable, write
+    from mbkit.report.output_folder import check_replaceable, check_writable, write
     from mbkit.studies.svg import image
 
     stems = [(f"{file.stem}-{case}" if case else file.stem) for file in files]

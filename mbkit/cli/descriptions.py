@@ -1,7 +1,4 @@
-"""`mbkit diff`: why two descriptions, or two engines on one, differ.
-
-`mbkit robots` and `mbkit convert`: descriptions by name, and in another format.
-"""
+"""`mbkit robots`, `mbkit convert` and `mbkit diff`: descriptions by name, in another format, and why two differ."""
 
 from __future__ import annotations
 

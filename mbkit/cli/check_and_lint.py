@@ -1,7 +1,4 @@
-"""`mbkit check`: do the engines agree on a model.
-
-`mbkit lint`: is the file itself plausible.
-"""
+"""`mbkit check`: do the engines agree on a model; `mbkit lint`: is the file itself plausible."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Progress of a study, and checkpoints of its result so far.
-
-Runs of studies: their start and time limit, and the warnings of the library.
-"""
+"""Runs of studies: start, time limit, warnings, progress, and checkpoints of the result so far."""
 
 from __future__ import annotations
 
