@@ -354,7 +354,7 @@ def _cell(line: Line, k: int) -> Span:
 
 
 def _plain(x: float | None, none: str = "") -> str:
-    return none if x is None else f"{x:g}"
+    return none if x is None else number_text(x)
 
 
 def _number(x: float | None) -> str:
