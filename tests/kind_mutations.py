@@ -37,9 +37,8 @@ SEES: dict[str, frozenset[str]] = {
     **dict.fromkeys(("impact", "operational space"), frozenset({"T", "row", "speed"})),
     # "without" takes the part out itself.
     **dict.fromkeys(("picture", "lint", "without"), frozenset()),
-    # A motion is found without forces, and losses and rotors are what is sought.
+    # A motion is found without forces.
     "excitation": frozenset(),
-    "identification": EVERY - {"loss", "jump", "T"},
     # What its rows push at rest is nothing in examples without weight.
     "equilibrium": frozenset({"V", "force"}),
     "mobility": frozenset({"row", "speed"}),
