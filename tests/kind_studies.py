@@ -34,6 +34,7 @@ from mbkit.engines.imported import reader
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.remote import environment
 from mbkit.engines.remote.packages import PACKAGES
+from mbkit.errors import UnsupportedError
 from mbkit.lagrangian import from_model
 from mbkit.lagrangian.summary import SystemSummary, python_code
 from mbkit.model import Model
@@ -678,7 +679,10 @@ def _plugin(x: Example, folder: Path) -> Told:
     config = SimpleNamespace(getoption=lambda _: True, rootpath=folder)
     fixture = MbkitBaseline(SimpleNamespace(path=folder / "test_x.py", node=node, config=config))  # type: ignore[arg-type]
     with patch("mbkit.studies.baseline.study._ROLLOUT", Rollout(STEP, 4)):
-        fixture(x.model, "x", engines=["lagrangian"], samples=1)
+        try:
+            fixture(x.model, "x", engines=["lagrangian"], samples=1)
+        except pytest.fail.Exception as error:
+            raise UnsupportedError(str(error)) from None
     config.getoption = lambda _: False
     if (less := without_part(x)) is None:
         fixture(x.model, "x")
@@ -724,8 +728,8 @@ def _work_precision(x: Example, folder: Path) -> Told:
         x.model, ["lagrangian"], ["rk4"], duration=DURATION, steps=[STEP], repeats=1, torque=x.tau,
         reference=lambda t: motion[t],
     )  # fmt: skip
-    (curve,) = out.curves
-    return min(p.error for p in curve.points), tuple(out.facts["notes"])
+    notes = *out.facts["notes"], *(r.reason for r in out.refusals)
+    return min((p.error for c in out.curves for p in c.points), default=np.inf), notes
 
 
 @column("studies", "steady motion", close=1e-8)

@@ -92,12 +92,13 @@ def test_springs_loops_couplings_and_couplers_are_set_too():
     before = b.build()
     b = mb.ModelBuilder.of(before)
     b.set_spring("spring", stiffness=7.0, point_a=(0, 0, -1.0))
-    b.set_coupling("tendon", damping=2.0)
+    b.set_coupling("tendon", damping=2.0, factors=(1.0, mb.Parameter("c", 0.5)))
     b.set_coupler("gear", offset=0.3)
     b.set_loop("rod", translation_b=(0, 0, 0.1), length=1.5)
     after = b.build()
     assert (after.springs[0].stiffness, after.springs[0].point_a.tolist()) == (7.0, [0, 0, -1.0])
     assert (after.couplings[0].stiffness, after.couplings[0].damping) == (1.0, 2.0)
+    assert after.with_parameters(c=0.7).couplings[0].factors.tolist() == [1.0, 0.7]
     assert (after.couplers[0].ratio, after.couplers[0].offset) == (2.0, 0.3)
     assert (after.loops[0].length, after.loops[0].translation_b.tolist()) == (1.5, [0, 0, 0.1])
     assert (before.springs[0].stiffness, before.loops[0].length) == (1.0, 1.0)
@@ -166,8 +167,10 @@ def test_a_removed_joint_takes_all_that_it_carries():
         (lambda b: b.set_joint("hing", damping=1.0), ["joint 'hing'", "did you mean 'hinge'"]),
         (lambda b: b.set_joint("hinge", damping="soft"), ["joint 'hinge': damping", "soft"]),
         (lambda b: b.set_joint("hinge", lower=3.0), ["joint 'hinge'", "lower"]),
+        (lambda b: b.set_joint("hinge", dampin=3.0), ["joint 'hinge': 'dampin'", "did you mean 'damping'"]),
         (lambda b: b.set_body("link", mass=-1.0), ["link", "-1"]),
         (lambda b: b.set_spring("spring", stiffness=1.0), ["spring 'spring'", "none"]),
+        (lambda b: b.set_frame("tip", body=7), ["frame 'tip': body", "7"]),
         (lambda b: b.set_frame("tip", rotation=np.ones((3, 3))), ["tip", "not a rotation matrix"]),
         (lambda b: b.add_payload("load", at="tipp", mass=1.0), ["payload 'load'", "'tipp'", "did you mean 'tip'"]),
         (

@@ -128,7 +128,7 @@ class Link:
     rate, drift : list of 6 scalars
         That relative velocity, and its derivative at constant velocities: zero where the columns stand still in C.
     rotors : list of scalars
-        Armature of each velocity, as the velocity that it follows feels it.
+        Rotor of each velocity, as the velocity that it follows feels it.
     inertia : Inertia
         The matter that is left to the link, about its origin.
     exact : Inertia

@@ -41,9 +41,9 @@ def from_model(
     """Return a model as a `Lagrangian` to read and to run: T, V and Rayleigh's dissipation in its coordinates.
 
     The joints' formulas are evaluated on exact sums of cosines and sines. Numbers are the decimals of the description.
-    Springs are in V, dampers in the dissipation, rotors in T. Dry friction is -f sign(v), which is zero at
-    rest, where that of the engines holds any force up to its bound; limits are data, as in every engine. Forces of
-    functions at joints are written out, their potentials in V.
+    Springs are in V, dampers in the dissipation, rotors in T. A force that jumps is -f sign(v), which is zero at rest,
+    where that of the engines holds up to its bound; limits are data, as in every engine. Forces of functions at
+    joints are written out, their potentials in V.
 
     Loop closures become holonomic constraints, in the order of `model.loops`, in the axes of the body that carries
     both ends, with the rows of `Dynamics.constraint_names`. A point closure has three, two in a plane, and its
@@ -86,7 +86,7 @@ def from_model(
     Warns
     -----
     MbkitWarning
-        Dry friction: no term of the equations holds a joint at rest.
+        No term of the equations holds a joint at rest that the engines hold.
 
     Notes
     -----

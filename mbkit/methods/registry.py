@@ -103,8 +103,10 @@ class Method:
         often slows it.
     own : str
         Of an engine's integrator: the method of mbkit with the same formula.
-    wrenches, dry_friction : bool
-        Whether wrenches may act on frames; whether it solves dry friction itself, and is not run phase by phase.
+    wrenches : bool
+        Whether wrenches may act on frames.
+    carries : frozenset of str
+        Effects of kinds of parts that it solves by itself, and for which it is not run phase by phase.
     """
 
     name: str
@@ -130,7 +132,7 @@ class Method:
     multistep: bool = False
     own: str = ""
     wrenches: bool = True
-    dry_friction: bool = False
+    carries: frozenset[str] = frozenset()
 
     @cached_property
     def formula(self) -> Formula | None:
@@ -154,7 +156,7 @@ class Method:
     @property
     def in_momenta(self) -> bool:
         """Whether its fixed step is one of (q, p), and no formula of velocities and accelerations."""
-        return self.kind == "fixed" and self.formula is None and not self.dry_friction
+        return self.kind == "fixed" and self.formula is None and not self.carries
 
     @property
     def code_name(self) -> str:
@@ -264,7 +266,7 @@ METHODS: Final[dict[str, Method]] = {
             1,
             stages=1,
             stability=SYMPLECTIC_EULER,
-            dry_friction=True,
+            carries=frozenset(["jump"]),
             compiled=True,
             solver="in_phases.moreau:run_moreau",
         ),

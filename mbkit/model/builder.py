@@ -225,7 +225,7 @@ _READERS: Final[Mapping[str, Callable[[ArgumentReader, str, Any], Any]]] = {
     "inertia": ArgumentReader.inertia,
     "joints": lambda read, name, value: tuple(read.name(name, x) for x in value),
     "leader": ArgumentReader.names,
-    "factors": lambda read, name, value: read.quantities(name, value, len(value)),
+    "factors": lambda read, name, value: read.quantities(name, value, np.size(value)),
 }
 
 

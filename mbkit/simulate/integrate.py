@@ -16,7 +16,8 @@ from mbkit.engines.constrained import unwatched
 from mbkit.engines.frames_and_momenta import axes_named
 from mbkit.errors import FunctionError, InputError, MbkitWarning, UnsupportedError, warn
 from mbkit.methods.registry import ADAPTIVE_METHOD, DEFAULT_METHOD, EULER_METHOD, METHODS, Method, Tolerances, method_of
-from mbkit.model import Model
+from mbkit.model import Joint, Model
+from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.simulate import solvers
 from mbkit.simulate.checks import diagnostics, massless_joints
@@ -29,9 +30,10 @@ from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, Indices, check_room, sa
 from mbkit.simulate.torque import RunWrenches, Torque, TorqueFunction
 
 _OTHERS: Final = f"use {DEFAULT_METHOD!r} or {ADAPTIVE_METHOD!r}"
+_DRY: Final = EFFECTS["jump"]
 #: Methods without events and equal steps, at which a joint could stop or let go.
 SMOOTH_RUNS: Final = Path(
-    "runs without phases", "", ALL - {"jump"}, {"jump": "this method does not know dry friction"}, instead=_OTHERS
+    "runs without phases", "", ALL - {"jump"}, {"jump": f"this method does not know {_DRY}"}, instead=_OTHERS
 )
 #: Smallest rtol of Taylor's method on the oracle, which computes with 113 bits.
 _MIN_RTOL_EXTENDED: Final = 1e-32
@@ -74,8 +76,8 @@ def integrate(
     if model.jumping_forces:
         warn(
             f"{model.name}: {', '.join(model.jumping_forces)} jumps where a velocity changes its sign. There it holds "
-            "nothing, and a run that comes to rest is wrong or goes on in ever smaller steps. Dry friction of a "
-            "description's joints is exact: add_joint(..., friction=...); or write tanh(v/v_s) for sign(v)",
+            "nothing, and a run that comes to rest is wrong or goes on in ever smaller steps. Joints of a description "
+            f"have exact {_DRY}: add_joint(..., {Joint.adding_to('jump')[0]}=...); or write tanh(v/v_s) for sign(v)",
             MbkitWarning,
         )
     own = dyn._under(*acting) if acting else dyn
@@ -184,27 +186,26 @@ def _acting(dyn: Dynamics, wrenches: RunWrenches | None, axes: str) -> Acting | 
 
 def _outcome(problem: IntegrationProblem, method: Method) -> SolverResult:
     dyn, read = problem.dyn, problem.torque
-    if method.dry_friction and "jump" not in dyn.model.effects:
+    if "jump" in method.carries and "jump" not in dyn.model.effects:
         # Without jumps its step is that of this method.
         method = METHODS[EULER_METHOD]
     elif method.kind == "adaptive" and not dyn.model.nv:
         # Where nothing moves, other methods have no scale and no series.
         method = METHODS[ADAPTIVE_METHOD]
     problem = replace(problem, method=method.name)
-    if dyn._soft_jumps and method.dry_friction:
+    if dyn._soft_jumps and "jump" in method.carries:
         raise UnsupportedError(
-            f"{method.name}: solves exact dry friction, and {dyn.engine} was asked for its own; leave soft_friction out"
+            f"{method.name}: solves exact {_DRY}, and {dyn.engine} was asked for its own; "
+            f"leave {', '.join(dyn._soft_jump_options)} out"
         )
     native = method.kind == "native"
     if not dyn._soft_jumps and (native or not (method.events or problem.equal_steps)):
         own = ", ".join(f"{name}={value}" for name, value in dyn._soft_jump_options.items() if native)
-        soft = (
-            f" (mbkit.dynamics(model, {dyn.engine!r}, {own}) has dry friction of its own, which is soft)" if own else ""
-        )
+        soft = f" (mbkit.dynamics(model, {dyn.engine!r}, {own}) has {_DRY} of its own, which is soft)" if own else ""
         SMOOTH_RUNS.admit(dyn.model, f"{method.name}{soft}: not known of")
     elif not dyn._soft_jumps:
         RUNS.admit(dyn.model)
-    if method.dry_friction:
+    if "jump" in method.carries:
         return _solver(dyn, method, read)(problem)
 
     def solver(smooth: Dynamics) -> Callable[[IntegrationProblem], SolverResult]:

@@ -232,15 +232,15 @@ class RunData:
     def work(self, engine: str | Dynamics | None = None) -> Array:
         """Return ∫ (τ + τ_lost + Σ Jᵀ w)·v dt since the first state in J, shape (K,) or (N, K).
 
-        τ_lost are the forces of dampers, dry friction, those given by functions without a potential, and those of
-        constraints that do work: drives of motions in time, blades with a speed, soft loops. Of a system
-        written as energies it holds what changes T + V beside its forces, as where a frame is moved.
+        τ_lost are the forces of joints and elements without a potential, and those of constraints that do work: drives
+        of motions in time, blades with a speed, soft loops. Of a system written as energies it holds what changes
+        T + V beside its forces, as where a frame is moved.
 
         The work of a constant or held torque is τ·Δq, exact for the saved positions, where v = q̇; UnsupportedError
-        where its rows change between two saved states. So is that of dry friction, ``f |Δq|`` from one stop or turn in
-        `events` to the next. All else, also torque on quasi-velocities, is a quadrature of fourth order in the distance
-        of the saved states, of second order in an interval with a turn or stop of theirs; a function that jumps
-        makes it first order, and so do rows that jump beside a function.
+        where its rows change between two saved states. So is that of a force f that jumps, ``f |Δq|`` from one stop or
+        turn in `events` to the next. All else, also torque on quasi-velocities, is a quadrature of fourth order in the
+        distance of the saved states, of second order in an interval with a turn or stop of theirs; a function that
+        jumps makes it first order, and so do rows that jump beside a function.
         """
         dyn, force, t, q, v = self._by(engine), self._acted(), self.t, self.q, self.v
         with unwatched(dyn):
@@ -264,7 +264,7 @@ class RunData:
         rows = power.reshape(-1, len(self.t))
         out, which = np.zeros((len(rows), len(self.t) - 1)), dyn._jumps.law.which
         for i, row in enumerate(rows):
-            # Phases end where a velocity with friction is zero; other events part nothing.
+            # Phases end where a velocity whose force jumps is zero; other events part nothing.
             ends = [x.t for x in self.events if x.member in (None, i) and (x.v[which] == 0).any()]
             around = [np.searchsorted(self.t, ends), np.searchsorted(self.t, ends, side="right") - 1]
             cuts = np.unique(np.clip([0, *around[0], *around[1], len(row) - 1], 0, len(row) - 1)).tolist()

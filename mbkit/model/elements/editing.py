@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from types import EllipsisType
 from typing import Any, Final, Self
@@ -131,20 +131,10 @@ class EditingBuilder:
         axis: ArrayLike | None = None,
         axis2: ArrayLike | None = None,
         pitch: Number | None = None,
-        lower: ArrayLike | None = None,
-        upper: ArrayLike | None = None,
-        velocity_limit: ArrayLike | None = None,
-        effort_limit: ArrayLike | None = None,
-        armature: _Numbers | None = None,
-        damping: _Numbers | None = None,
-        friction: ArrayLike | None = None,
-        stiffness: _Numbers | None = None,
-        rest: _Numbers | None = None,
-        stiction: ArrayLike | None = None,
-        stribeck_velocity: ArrayLike | None = None,
         mimic: Mimic | tuple[str, Number, Number] | EllipsisType | None = ...,
+        **numbers: _Numbers | ArrayLike | None,
     ) -> None:
-        """Set numbers of a joint, which are those of `add_joint`; an infinite limit is no limit.
+        """Set a joint; the arguments, `numbers` among them, are those of `add_joint`. An infinite limit is no limit.
 
         With ``mimic=None`` a mimic joint has its own coordinate again. Joints that a file let follow it follow its
         leader, as before.
@@ -157,9 +147,7 @@ class EditingBuilder:
                 f"joint {name!r} is a point of beam {joint.mimic.joint!r}; set that joint, or its root"
             )
             return
-        limits = lower, upper, velocity_limit, effort_limit
-        numbers = armature, damping, friction, stiffness, rest, stiction, stribeck_velocity
-        given: dict[str, Any] = dict(zip(NUMBERS_OF_JOINTS, (*limits, *numbers), strict=True))
+        given = self._known(f"joint {joint.name!r}", numbers, NUMBERS_OF_JOINTS)
         given |= {"axes": None if axis is None and axis2 is None else (axis, axis2)}
         given |= {} if mimic is ... else {"mimic": mimic}
         ready = self._joint_fields(joint.name, joint.type, {n: x for n, x in given.items() if x is not None})
@@ -180,33 +168,15 @@ class EditingBuilder:
         """Set the body or the pose of a frame; the arguments are those of `add_frame`."""
         turned = rotation is not None or rpy is not None
         ready = {"rotation": self._read.orientation(f"frame {shown(name)}", rotation, rpy)} if turned else {}
-        self._set("frames", name, {"body": body, "translation": translation}, ready)
+        ready |= {} if body is None else self._read_fields(Frame, f"frame {shown(name)}", {"body": body})
+        self._set("frames", name, {"translation": translation}, ready)
 
-    def set_spring(
-        self,
-        name: str,
-        *,
-        point_a: _Vector | None = None,
-        point_b: _Vector | None = None,
-        stiffness: Number | None = None,
-        rest_length: Number | None = None,
-        damping: Number | None = None,
-    ) -> None:
-        """Set numbers of a spring between points; the arguments are those of `add_spring`."""
-        numbers = {"stiffness": stiffness, "rest_length": rest_length, "damping": damping}
-        self._set("springs", name, {"point_a": point_a, "point_b": point_b, **numbers})
+    def set_spring(self, name: str, **numbers: Number | _Vector | None) -> None:
+        """Set points or numbers of a spring between points; the arguments are those of `add_spring`."""
+        self._set("springs", name, numbers)
 
-    def set_coupling(
-        self,
-        name: str,
-        *,
-        stiffness: Number | None = None,
-        rest_length: Number | None = None,
-        damping: Number | None = None,
-        armature: Number | None = None,
-    ) -> None:
-        """Set numbers of a coupling of joints; the arguments are those of `add_coupling`."""
-        numbers = {"stiffness": stiffness, "rest_length": rest_length, "damping": damping, "armature": armature}
+    def set_coupling(self, name: str, **numbers: _Numbers | None) -> None:
+        """Set numbers of a coupling of joints, those of `add_coupling`, or its factors, one for each joint."""
         self._set("couplings", name, numbers)
 
     def set_loop(
@@ -387,9 +357,15 @@ class EditingBuilder:
         part = self._named(kind, name)
         if part is None:
             return
-        given = {n: x for n, x in values.items() if x is not None}
-        fields = self._read_fields(type(part), f"{called(kind)} {part.name!r}", given) | dict(ready or {})
-        self._change(kind, part, fields)
+        item = f"{called(kind)} {part.name!r}"
+        given = self._known(item, values, rules_of(type(part)))
+        self._change(kind, part, self._read_fields(type(part), item, given) | dict(ready or {}))
+
+    def _known(self, item: str, values: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+        """Return what is given of these names; others are faults."""
+        for name in (n for n in values if n not in names):
+            self._read.faults.append(f"{item}: {name!r}: there is no such number{did_you_mean(name, names)}")
+        return {n: x for n, x in values.items() if x is not None and n in names}
 
     def _change(self, kind: str, part: Any, fields: dict[str, Any]) -> None:
         bound = {*fields}

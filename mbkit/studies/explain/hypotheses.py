@@ -368,7 +368,7 @@ def joint_mistakes(joint: Joint) -> list[Mistake]:
         rows.append(("mimic", f"leaves it free, which follows {joint.mimic.joint!r}", {"mimic": None}))
         rows.append(("mimic", "leaves out the offset at which it follows", {"mimic": replace(joint.mimic, offset=0.0)}))
     for factor, says in ((_DEGREE, "per degree for per radian"), (1 / _DEGREE, "per radian for per degree")):
-        given = ((n, getattr(joint, n)) for n in ("damping", "stiffness"))
+        given = ((n, getattr(joint, n)) for n, rule in rules_of(Joint).items() if rule.does and "/rad" in rule.unit)
         rows += [("unit of angle", f"has {n} {says}", {n: factor * x}) for n, x in given]
     misread = "reads the joint's quaternion in the wrong order"
     inverse = {"rotation": R.T, "translation": -R.T @ p}
