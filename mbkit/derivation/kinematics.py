@@ -6,7 +6,7 @@ description vanishes while the graph is built.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
 from typing import Any
 
@@ -15,7 +15,7 @@ import casadi as ca
 from mbkit.derivation import model_values
 from mbkit.derivation.model_values import Constants, Values, is_zero, scalar
 from mbkit.model import GravityCompensation, Joint, JointCoupling, Model
-from mbkit.model.changes.jumps import JumpNumbers, jump_bindings
+from mbkit.model.changes.jumps import jump_rates
 from mbkit.model.joint_types import cross3, dot3
 from mbkit.model.parts import PointSpring
 
@@ -328,17 +328,3 @@ def damping_forces(kin: Kinematics) -> Any:
     smooth = -ca.gradient(dissipation(kin), kin.v)
     jumps = [ca.gradient(rate, kin.v) * (size * ca.sign(rate)) for rate, size in jump_rates(kin, ca.exp)]
     return smooth - sum(jumps[1:], jumps[0]) if jumps else smooth
-
-
-def jump_rates(kin: Kinematics, exp: Callable[[Any], Any]) -> Iterator[tuple[Any, Any]]:
-    """Yield the rate of each velocity with dry friction, and its f(|v|)."""
-    free = {(b.part, b.index[0]) for b in jump_bindings(kin.model)}
-    for joint in kin.model.joints:
-        values, given = kin.values.of(joint), JumpNumbers.of([joint])
-        for k in range(joint.type.nv):
-            if not (given.sliding[k] + given.bound[k] or (joint.name, k) in free):
-                continue
-            rate, size = kin.velocities(joint)[k], values.friction[k]
-            if given.stribeck[k]:
-                size += (values.stiction[k] - size) * exp(-((rate / values.stribeck_velocity[k]) ** 2))
-            yield rate, size

@@ -9,7 +9,7 @@ from typing import Final, cast
 
 import sympy as sp
 
-from mbkit.derivation.kinematics import dissipation, jump_rates, spring_energy
+from mbkit.derivation.kinematics import dissipation, spring_energy
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError, warn
 from mbkit.lagrangian.description_kinematics import INSTEAD_OF_WRITING, SymbolicKinematics, exact, written_rows
 from mbkit.lagrangian.elements import acting, law
@@ -19,7 +19,7 @@ from mbkit.lagrangian.summary import in_symbols
 from mbkit.lagrangian.system import Lagrangian, QuasiLagrangian
 from mbkit.lagrangian.trig.simplify import tidy
 from mbkit.model import Joint, Model
-from mbkit.model.changes.jumps import held_at_rest
+from mbkit.model.changes.jumps import held_at_rest, jump_rates
 from mbkit.model.elements.beams import BeamEnd
 from mbkit.model.elements.motion_laws import MOTION_LAWS, motions_of
 from mbkit.model.elements.paths import ALL, Path

@@ -10,7 +10,7 @@ falls from s to f at once.) A joint that mimics another has its own friction, wh
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
@@ -72,6 +72,20 @@ class JumpNumbers(NamedTuple):
 def jump_bindings(model: Model) -> list[Binding]:
     """Return the numbers of dry friction that are expressions of parameters."""
     return [b for b in model.bindings if b.where == "joints" and b.field in _BOUND]
+
+
+def jump_rates(kin: Any, exp: Callable[[Any], Any]) -> Iterator[tuple[Any, Any]]:
+    """Yield the rate of each velocity with dry friction, and its f(|v|), as `mbkit.derivation.kinematics` has them."""
+    free = {(b.part, b.index[0]) for b in jump_bindings(kin.model)}
+    for joint in kin.model.joints:
+        values, given = kin.values.of(joint), JumpNumbers.of([joint])
+        for k in range(joint.type.nv):
+            if not (given.sliding[k] + given.bound[k] or (joint.name, k) in free):
+                continue
+            rate, size = kin.velocities(joint)[k], values.friction[k]
+            if given.stribeck[k]:
+                size += (values.stiction[k] - size) * exp(-((rate / values.stribeck_velocity[k]) ** 2))
+            yield rate, size
 
 
 class JumpLaw:
