@@ -701,6 +701,27 @@ def _batch(x: Example, folder: Path) -> Told:
     return max(max(off(aligned(run.q[k, -1], x, q), q), off(run.v[k, -1], v)) for k in range(2))
 
 
+@column("use of runs", "state feedback", close=1e-8)
+def _feedback(x: Example, folder: Path) -> Told:
+    """One state's is data, which machine code evaluates; that of a batch is a policy."""
+    n, m = len(x.q), len(x.v)
+    gain = np.hstack([0.2 * np.ones((m, n)) if n == m else np.zeros((m, n)), 0.5 * np.eye(m)])
+
+    def force(t: float, q: np.ndarray, v: np.ndarray, members: Any = None) -> np.ndarray:
+        return x.tau - np.concatenate([q, v], axis=-1) @ gain.T
+
+    wanted, worst = x.state(x.flow([DURATION], force)[-1]), 0.0
+    in_machine_code = dynamics(x, x.model, compile=True)
+    for dyn, torque, start in (
+        (in_machine_code, mb.simulate.StateFeedback(gain, torque=x.tau), (x.q, x.v)),
+        (engine(x.name), mb.simulate.Policy(force), (np.stack([x.q] * 2), np.stack([x.v] * 2))),
+    ):
+        run = mb.simulate(dyn, *start, DURATION, "rk4", STEP, torque=torque, t0=x.t, save=[x.t + DURATION], doubt=False)
+        q, v = (y if y.ndim == 2 else y[-1] for y in (run.q, run.v))
+        worst = max(worst, off(aligned(q[-1], x, wanted[0]), wanted[0]), off(v[-1], wanted[1]))
+    return worst
+
+
 @column("use of runs", "events", close=1e-7)
 def _events(x: Example, folder: Path) -> Told:
     """A velocity's value in the middle of the truth is crossed there."""
