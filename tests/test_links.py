@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import mbkit as mb
@@ -15,6 +16,7 @@ from mbkit.derivation.least_constraint import hard_poses
 from mbkit.derivation.links import Links
 from mbkit.derivation.rotations import SYMMETRIC, Matrix, Permutation, PlaneRotation, congruence, to_child, to_parent
 from mbkit.model.joint_types import KINDS
+from mbkit.model.parts import RESTING
 from mbkit.spatial import matrix_from_quaternion, normalized
 from tests.random_trees import off, random_tree, rotation, states
 from tests.scenes import chain
@@ -182,6 +184,36 @@ def test_the_form_with_the_fewest_operations_is_taken(name):
     chosen = operations(eq, eq.forward_dynamics)
     for depth in eq._carried():
         assert chosen <= 1.001 * operations(eq, eq._reduced(eq.mechanics, depth))
+
+
+def test_rotors_that_hold_take_the_short_form_and_fixed_joints_are_no_other():
+    """What rests by friction has a rotor that is a parameter; of UR5 the plain frames take half as much again."""
+    bare = mb.load("ur5").without("friction").without("damping")
+    b = mb.ModelBuilder.of(bare)
+    for name in bare.joint_names:
+        b.set_joint(name, armature=mb.Parameter(f"rotor of {name}", 0.0))
+    eq = LinkEquations(b.build(), elimination="links")
+    assert ca.n_nodes(eq.forward_dynamics) < 1.1 * ca.n_nodes(LinkEquations(bare, elimination="links").forward_dynamics)
+    at, rng, rows = sample(bare, 20), np.random.default_rng(0), range(20)
+    held = rng.random((20, bare.nv)) < 0.5
+    robot = pin.buildModelFromUrdf(bare.source)
+    data, force = robot.createData(), at["t"]
+    for i in rows:
+        pin.crba(robot, data, at["q"][i])
+        M = np.triu(data.M) + np.triu(data.M, 1).T
+        free, pull = ~held[i], force[i] - pin.rnea(robot, data, at["q"][i], at["v"][i], 0 * force[i])
+        a = np.zeros(bare.nv)
+        a[free] = np.linalg.solve(M[np.ix_(free, free)], pull[free])
+        own = np.array(eq.function("forward_dynamics")(at["q"][i], at["v"][i], force[i], RESTING * held[i]))[:, 0]
+        assert np.abs(own - a).max() < 64 * EPS * np.linalg.cond(M) * np.abs(a).max()
+
+
+def test_a_parameter_that_moves_matter_leaves_the_plain_frames():
+    """Its values are not known where the form is chosen."""
+    b = mb.ModelBuilder.of(mb.load("ur5"))
+    b.set_body("forearm_link", mass=mb.Parameter("mass", 2.0))
+    eq = LinkEquations(b.build(), elimination="links")
+    assert ca.n_nodes(eq.forward_dynamics) == ca.n_nodes(eq._reduced(eq.plain, ()))
 
 
 @pytest.mark.thorough

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cache, cached_property
+from itertools import product
 from typing import Any, Final
 
 import casadi as ca
@@ -36,6 +37,7 @@ from mbkit.derivation.links import Links
 from mbkit.derivation.mass_matrix_solve import implicit, solve
 from mbkit.derivation.model_values import Constants, scalar
 from mbkit.model import Model
+from mbkit.model.parts import RESTING, Joint
 
 #: Carrying the velocities of so many more links is tried in vain before the search for the fewest operations ends.
 _PATIENCE: Final = 2
@@ -43,6 +45,8 @@ _PATIENCE: Final = 2
 _CORNERS: Final = 8
 #: Velocities and forces at each pose.
 _STATES: Final = 3
+#: Random choices of rotors that hold.
+_HELD: Final = 2
 #: Distance in eps from which a short form of accelerations has lost digits, and one of forces: rounding of the forms
 #: themselves makes up to 1.3 on robots, and up to 38 on a chain of 128 links.
 _MAX_ERROR: Final = 1.4
@@ -180,24 +184,22 @@ class LinkEquations(Equations):
         """Return how far two forms of the accelerations are apart at hard poses, in eps.
 
         Accelerations are √M_jj a_j, beside those of the forces that act; their gap counts per cond(M), and so does the
-        force that it amounts to. Infinite where M is singular, and of a model with parameters, whose values may change.
+        force that it amounts to. Infinite where M is singular.
         """
-        model, rng = self.model, np.random.default_rng(0)
-        if model.parameters:
-            return np.inf
-        given, idle = [self.q, self.v, self.force], np.zeros(self.force.numel() - model.nv)
+        model, rng, idle = self.model, np.random.default_rng(0), np.zeros(self.force.numel() - self.model.nv)
+        given = [self.q, self.v, self.force, *self.extra_arguments.values()]
         forms = ca.Function("forms", given, [ca.densify(x) for x in (form, exact, self.nle, self.passive)])
         worst = 0.0
         with np.errstate(all="ignore"):
             poses = self._poses(rng)
-            for pose, M in zip(poses, mass_matrices(model, poses), strict=True):
+            for more, (pose, M) in product(self._values, zip(poses, mass_matrices(model, poses), strict=True)):
                 root = np.sqrt(np.diag(M))
                 scaled = M / np.outer(root, root)
                 if not np.isfinite(scaled).all():
                     return np.inf
                 condition, norm = np.linalg.cond(scaled), np.linalg.norm(scaled, 2)
                 for v, tau in rng.standard_normal((_STATES, 2, model.nv)):
-                    one, two, nle, passive = (np.array(x)[:, 0] for x in forms(pose, v, np.append(tau, idle)))
+                    one, two, nle, passive = (np.array(x)[:, 0] for x in forms(pose, v, np.append(tau, idle), *more))
                     acting = (np.abs(tau) + np.abs(nle) + np.abs(passive)) / root
                     size = max(np.linalg.norm(root * two), np.linalg.norm(acting))
                     gap = root * (one - two)
@@ -210,17 +212,29 @@ class LinkEquations(Equations):
     def _force_error(self, form: Any, exact: Any) -> float:
         """Return how far two forms of inverse dynamics are apart at hard poses, in eps."""
         model, rng, worst = self.model, np.random.default_rng(0), 0.0
-        if model.parameters:
-            return np.inf
-        forms = ca.Function("forms", [self.q, self.v, self.a], [ca.densify(x) for x in (form, exact)])
+        given = [self.q, self.v, self.a, *self.extra_arguments.values()]
+        forms = ca.Function("forms", given, [ca.densify(x) for x in (form, exact)])
         with np.errstate(all="ignore"):
-            for pose in self._poses(rng):
-                one, two = (np.array(x)[:, 0] for x in forms(pose, *rng.standard_normal((2, model.nv))))
+            for pose, more in product(self._poses(rng), self._values):
+                one, two = (np.array(x)[:, 0] for x in forms(pose, *rng.standard_normal((2, model.nv)), *more))
                 error = np.linalg.norm(one - two) / np.linalg.norm(two)
                 if not np.isfinite(error):
                     return np.inf
                 worst = max(worst, float(error))
         return worst / EPS
+
+    @cached_property
+    def _values(self) -> list[tuple[Array, ...]]:
+        """Values of the parameters: rotors turn or hold, forces act, and NaN is of those that may do anything else."""
+        does: dict[str, set[str]] = {name: set() for name in self.model.parameters}
+        for b in self.model.bindings:
+            rotor = b.where == "joints" and b.field in Joint.adding_to("T")
+            for p in b.expression.parameters():
+                does[p.name].add("rotor" if rotor else b.where)
+        held = np.array([RESTING if of == {"rotor"} else 0.0 for of in does.values()])
+        plain = np.array([1.0 if of == {"forces"} else 0.0 if of == {"rotor"} else np.nan for of in does.values()])
+        choices = np.random.default_rng(0).integers(0, 2, size=(_HELD, len(held)))
+        return [(plain + choice * held,) for choice in (0, *choices)] if does else [()]
 
     def _poses(self, rng: np.random.Generator) -> Array:
         """Return poses at which axes align, the ends of limits among them."""

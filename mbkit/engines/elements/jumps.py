@@ -49,18 +49,19 @@ _POWER_TIE_RATIO: Final = 1e-9
 
 def forces_at_rest(A: Array, b: Array, bound: Array) -> Array:
     """Return the forces of `solve_at_rest` of one problem whose A may be singular, (n,)."""
-    every = np.ones((1, len(b)), dtype=bool)
-    return np.asarray(solve_at_rest(A[None], b[None], bound[None], every, definite=False)[0][0])
+    every, none = np.ones((1, len(b)), dtype=bool), np.zeros((1, len(b)))
+    return np.asarray(solve_at_rest(A[None], b[None], bound[None], every, none, definite=False)[0][0])
 
 
-def solve_at_rest(A: Array, b: Array, bound: Array, on: Mask, *, definite: bool) -> tuple[Array, Array]:
+def solve_at_rest(A: Array, b: Array, bound: Array, on: Mask, side: Array, *, definite: bool) -> tuple[Array, Array]:
     """Return the λ with |λ| <= bound that minimize ½ λᵀ A λ + bᵀ λ, and the signs of those at bounds; (N, n) each.
 
     λ is zero where `on` is False. A, (N, n, n), is positive definite or semidefinite. Of a semidefinite one, λ is the
     limit of proximal points, whose A is definite (Rockafellar 1976, SIAM Journal on Control and Optimization 14).
+    `side` is a first guess of the signs.
     """
     if definite:
-        return _of_definite(A, b, bound, on)
+        return _of_definite(A, b, bound, on, side)
     size = np.abs(np.einsum("nii->ni", A))
     # To each its own: a joint that hardly responds takes as few points as the others.
     near = _PROXIMAL_SHIFT * np.where(size > 0, size, 1.0)
@@ -69,13 +70,13 @@ def solve_at_rest(A: Array, b: Array, bound: Array, on: Mask, *, definite: bool)
     forces = np.zeros(b.shape)
     for _ in range(_MAX_PROXIMAL_POINTS):
         before = forces
-        forces, side = _of_definite(own, b - near * before, bound, on)
+        forces, side = _of_definite(own, b - near * before, bound, on, side)
         if (near * np.abs(forces - before) <= noise).all():
             return forces, side
     raise NumericalError(_UNDECIDED.format(n=b.shape[1]))
 
 
-def _of_definite(A: Array, b: Array, bound: Array, on: Mask) -> tuple[Array, Array]:
+def _of_definite(A: Array, b: Array, bound: Array, on: Mask, side: Array) -> tuple[Array, Array]:
     """Return what `solve_at_rest` does, where A is positive definite.
 
     The set of forces at their bounds is exchanged as a whole as long as fewer conditions fail, then one by one, the
@@ -84,7 +85,8 @@ def _of_definite(A: Array, b: Array, bound: Array, on: Mask) -> tuple[Array, Arr
     """
     size, n = b.shape
     forces = np.zeros((size, n))
-    side, best, left = np.zeros((size, n)), np.full(size, n + 1), np.full(size, _MAX_ROUNDS_WITHOUT_PROGRESS)
+    best, left = np.full(size, n + 1), np.full(size, _MAX_ROUNDS_WITHOUT_PROGRESS)
+    side = np.where(on, side, 0.0)
     going = np.arange(size)
     # A velocity that is undecided to rounding is at rest.
     noise = _noise(A, b, bound)
@@ -138,12 +140,14 @@ def jump_forces(
     """
     forces, holds = np.zeros(b.shape), np.zeros(b.shape, dtype=bool)
     lower, upper, free = np.where(known < 0, known, -bound), np.where(known > 0, known, bound), on & (known != 0)
-    rows = np.arange(len(b))
+    rows, sides = np.arange(len(b)), np.zeros(b.shape)
     while len(rows):
         own, low, high, loose, act = A[rows], lower[rows], upper[rows], free[rows], on[rows]
         middle = np.where(act, np.where(loose, known[rows], 0.5 * (low + high)), 0.0)
         pushed = b[rows] + (own @ middle[..., None])[..., 0]
-        x, side = solve_at_rest(own, pushed, 0.5 * (high - low), act & ~loose, definite=definite)
+        given = own, pushed, 0.5 * (high - low), act & ~loose, sides[rows]
+        x, sides[rows] = solve_at_rest(*given, definite=definite)
+        side = sides[rows]
         forces[rows] = x = np.where(side < 0, low, np.where(side > 0, high, middle + x))
         a = b[rows] + (own @ x[..., None])[..., 0]
         # Forces of loops are not unique: what is at its bound may be held by the others, to the rounding of A.
