@@ -129,6 +129,22 @@ def test_one_joint_holds_wherever_it_can_and_then_has_the_friction_of_motion() -
     assert a[:, 0] == pytest.approx([0.0, 1.5, -1.5], rel=1e-15)
 
 
+def test_of_a_batch_machine_code_decides_which_of_all_patterns_it_is() -> None:
+    """The same exchanges as symbols; accelerations are those of all patterns that each state may have."""
+    rng, n = np.random.default_rng(4), 3
+    masses, f = rng.uniform(0.3, 3, n), rng.uniform(0.5, 3, n)
+    s = f * rng.uniform(1, 2.5, n)
+    q, tau = states(rng, n, 100)
+    written, run = (mb.dynamics(chain(f, s, masses), "lagrangian", compile=compiled) for compiled in (False, True))
+    a, other = (dyn.forward_dynamics(q, np.zeros(q.shape), tau) for dyn in (run, written))
+    assert any("exchange_rounds" in key for key in run._machines)
+    assert off(a, other) < 1e-13
+    np.testing.assert_array_equal(a == 0, other == 0)
+    every, fits = consistent(mass_matrices(masses, q), tau, f, s)
+    same = ((every == 0) == (a == 0)).all(axis=-1) & (np.abs(every - a).max(axis=-1) <= 1e-11 * np.abs(every).max())
+    assert (same & fits).any(axis=0).all()
+
+
 @pytest.mark.thorough("1")
 @pytest.mark.parametrize("seed", range(2))
 def test_of_several_patterns_it_is_that_of_a_stribeck_velocity_that_goes_to_zero(seed: int) -> None:

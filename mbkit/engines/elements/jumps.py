@@ -20,149 +20,74 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mbkit._check import EPS, Array
+from mbkit._check import Array
 from mbkit._reproducible import unit_rows
 from mbkit.engines.elements.passive import LOADS, UNDER_FORCE, AddedForce
 from mbkit.errors import MbkitWarning, NumericalError, UnsupportedError, warn
+from mbkit.methods.exchanges import ARRAYS, PATIENCE, PROXIMAL_SHIFT, Problem, Signs, exchange, noise, restricted
 from mbkit.model import Model
 from mbkit.model.changes.jumps import JumpLaw, Sliding, jump_bindings
-from mbkit.model.parts import POSE_ROUNDING, RESTING, ROUNDING
+from mbkit.model.parts import POSE_ROUNDING, RESTING
 
 #: Mask of the velocities at rest.
 Mask = NDArray[np.bool_]
-#: Rounds of exchanges that may leave as many conditions failing; then conditions are exchanged one by one.
-_MAX_ROUNDS_WITHOUT_PROGRESS: Final = 3
 #: Phases that dynamics keep.
 _MAX_KEPT_PHASES: Final = 256
 _FORWARD: Final = "forward_dynamics"
 _DOUBLE_SIGNIFICAND_BITS: Final = 53
-#: Part of the forces that their sums lose to rounding.
-_FORCE_ROUNDING: Final = 64 * EPS
-#: Addition to the diagonal of a singular A: far from its own rounding and from what is not rounding.
-_PROXIMAL_SHIFT: Final = 2.0**-32
-#: Proximal points; two are enough, unless A is nearly singular, too.
-_MAX_PROXIMAL_POINTS: Final = 10_000
+#: Rounds of exchanges, at most; a nearly singular A takes more than two proximal points.
+_MAX_ROUNDS: Final = 20_000
 _UNDECIDED: Final = "dry friction: which of {n} joints at rest begin to move cannot be decided: singular inertia"
-#: Joints whose power differs by less than this part let go together, as rounding does not break a symmetry.
-_POWER_TIE_RATIO: Final = 1e-9
 
 
 def forces_at_rest(A: Array, b: Array, bound: Array) -> Array:
-    """Return the forces of `solve_at_rest` of one problem whose A may be singular, (n,)."""
-    every, none = np.ones((1, len(b)), dtype=bool), np.zeros((1, len(b)))
-    return np.asarray(solve_at_rest(A[None], b[None], bound[None], every, none, definite=False)[0][0])
-
-
-def solve_at_rest(A: Array, b: Array, bound: Array, on: Mask, side: Array, *, definite: bool) -> tuple[Array, Array]:
-    """Return the λ with |λ| <= bound that minimize ½ λᵀ A λ + bᵀ λ, and the signs of those at bounds; (N, n) each.
-
-    λ is zero where `on` is False. A, (N, n, n), is positive definite or semidefinite. Of a semidefinite one, λ is the
-    limit of proximal points, whose A is definite (Rockafellar 1976, SIAM Journal on Control and Optimization 14).
-    `side` is a first guess of the signs.
-    """
-    if definite:
-        return _of_definite(A, b, bound, on, side)
-    size = np.abs(np.einsum("nii->ni", A))
-    # To each its own: a joint that hardly responds takes as few points as the others.
-    near = _PROXIMAL_SHIFT * np.where(size > 0, size, 1.0)
-    own = A + near[..., None] * np.eye(b.shape[1])
-    noise = _noise(A, b, bound)
-    forces = np.zeros(b.shape)
-    for _ in range(_MAX_PROXIMAL_POINTS):
-        before = forces
-        forces, side = _of_definite(own, b - near * before, bound, on, side)
-        if (near * np.abs(forces - before) <= noise).all():
-            return forces, side
-    raise NumericalError(_UNDECIDED.format(n=b.shape[1]))
-
-
-def _of_definite(A: Array, b: Array, bound: Array, on: Mask, side: Array) -> tuple[Array, Array]:
-    """Return what `solve_at_rest` does, where A is positive definite.
-
-    The set of forces at their bounds is exchanged as a whole as long as fewer conditions fail, then one by one, the
-    last first, which ends (Murty 1974, Linear Algebra and its Applications 9; Júdice and Pires 1994, Computers and
-    Operations Research 21).
-    """
-    size, n = b.shape
-    forces = np.zeros((size, n))
-    best, left = np.full(size, n + 1), np.full(size, _MAX_ROUNDS_WITHOUT_PROGRESS)
-    side = np.where(on, side, 0.0)
-    going = np.arange(size)
-    # A velocity that is undecided to rounding is at rest.
-    noise = _noise(A, b, bound)
-    for _ in range(100 * (n + 1) ** 2):
-        own, here = A[going], side[going]
-        inner = on[going] & (here == 0)
-        at_bound = here * bound[going]
-        pushed = b[going] + (own @ at_bound[..., None])[..., 0]
-        x = np.where(inner, _restricted(own, -pushed, inner), at_bound)
-        a = b[going] + (own @ x[..., None])[..., 0]
-        wrong = np.where(inner, np.abs(x) > bound[going] * (1 + ROUNDING), here * a > noise[going])
-        forces[going] = x
-        counts = wrong.sum(axis=1)
-        fewer = counts < best[going]
-        alone = ~fewer & (left[going] == 0)
-        last = np.cumsum(wrong[:, ::-1], axis=1)[:, ::-1] == 1
-        change = np.where(alone[:, None], wrong & last, wrong)
-        best[going] = np.where(fewer, counts, best[going])
-        left[going] = np.where(fewer, _MAX_ROUNDS_WITHOUT_PROGRESS, np.maximum(left[going] - 1, 0))
-        side[going] = np.where(change, np.where(inner, np.sign(x), 0.0), here)
-        going = going[counts > 0]
-        if not len(going):
-            return forces, side
-    raise NumericalError(_UNDECIDED.format(n=n))
-
-
-def _noise(A: Array, b: Array, bound: Array) -> Array:
-    """Return the rounding of accelerations under forces up to their bounds, (N, n)."""
-    return np.asarray(_FORCE_ROUNDING * (np.abs(b) + (np.abs(A) @ bound[..., None])[..., 0]))
-
-
-def _restricted(A: Array, right: Array, on: Mask, *, definite: bool = True) -> Array:
-    """Return the x with A x = right in the entries that are on, and zero in the others, (N, n)."""
-    # The others have an equation of their own, of the size of A.
-    size = np.abs(np.einsum("nii->ni", A)).max(axis=1, initial=1e-300)[:, None, None]
-    own = np.where(on[:, :, None] & on[:, None, :], A, size * np.eye(A.shape[-1]) * ~on[:, :, None])
-    right = np.where(on, right, 0.0)[..., None]
-    x = np.linalg.solve(own, right) if definite else np.linalg.pinv(own, rcond=_PROXIMAL_SHIFT, hermitian=True) @ right
-    return np.asarray(x[..., 0])
+    """Return the λ with |λ| <= bound that minimizes ½ λᵀ A λ + bᵀ λ of one problem whose A may be singular, (n,)."""
+    every, most = np.ones((1, len(b)), dtype=bool), bound[None]
+    return np.asarray(jump_forces(A[None], b[None], most, most, every, 0.0 * most, definite=False)[0][0])
 
 
 def jump_forces(
-    A: Array, b: Array, bound: Array, less: Array, on: Mask, known: Array, *, definite: bool = True
+    A: Array,
+    b: Array,
+    bound: Array,
+    less: Array,
+    on: Mask,
+    known: Array,
+    *,
+    definite: bool = True,
+    rounds: Callable[[Problem, Signs], tuple[Signs, Any, Any, Any]] | None = None,
 ) -> tuple[Array, Mask]:
     """Return the forces of friction at rest, and which of them hold; those `known` do not; (N, n).
 
-    First all hold up to their bounds. Of those that would move, the one whose friction takes the most power lets go:
-    on that side it has `less` from then on, the friction of motion, and the problem is solved again with what the
-    others feel of it. It may come to hold after all. Each round lowers a bound, so that there are 2 n at most, and the
-    last is consistent: a joint holds within its bound, or moves against the friction of motion.
+    A, (N, n, n), is positive definite or semidefinite. The way is that of `mbkit.methods.exchanges`; `rounds` makes
+    some of its rounds at once.
     """
-    forces, holds = np.zeros(b.shape), np.zeros(b.shape, dtype=bool)
-    lower, upper, free = np.where(known < 0, known, -bound), np.where(known > 0, known, bound), on & (known != 0)
-    rows, sides = np.arange(len(b)), np.zeros(b.shape)
-    while len(rows):
-        own, low, high, loose, act = A[rows], lower[rows], upper[rows], free[rows], on[rows]
-        middle = np.where(act, np.where(loose, known[rows], 0.5 * (low + high)), 0.0)
-        pushed = b[rows] + (own @ middle[..., None])[..., 0]
-        given = own, pushed, 0.5 * (high - low), act & ~loose, sides[rows]
-        x, sides[rows] = solve_at_rest(*given, definite=definite)
-        side = sides[rows]
-        forces[rows] = x = np.where(side < 0, low, np.where(side > 0, high, middle + x))
-        a = b[rows] + (own @ x[..., None])[..., 0]
-        # Forces of loops are not unique: what is at its bound may be held by the others, to the rounding of A.
-        size = _PROXIMAL_SHIFT / _FORCE_ROUNDING * _noise(own, b[rows], bound[rows])
-        moves = side != 0 if definite else side * a < -size
-        holds[rows] = act & ~loose & ~moves
-        falls = moves & (np.abs(x) > less[rows])
-        power = np.where(falls, np.abs(a) * bound[rows], 0.0)
-        first = falls & (power >= (1 - _POWER_TIE_RATIO) * power.max(axis=1, keepdims=True))
-        lower[rows] = np.where(first & (side < 0), -less[rows], low)
-        upper[rows] = np.where(first & (side > 0), less[rows], high)
-        # A joint that is known to leave may be held by what the others do then.
-        free[rows] &= ~first.any(axis=1, keepdims=True)
-        rows = rows[first.any(axis=1)]
-    return forces, holds
+    size, n = b.shape
+    shift, own = None, A
+    if not definite:
+        diagonal = np.abs(np.einsum("nii->ni", A))
+        # To each its own: a joint that hardly responds takes as few points as the others.
+        shift = PROXIMAL_SHIFT * np.where(diagonal > 0, diagonal, 1.0)
+        own = A + shift[..., None] * np.eye(n)
+    problem = Problem(A, own, b, bound, less, on, known, noise(A, b, bound), shift)
+    low, high = np.where(known < 0, known, -bound), np.where(known > 0, known, bound)
+    none, one = np.zeros(b.shape), np.ones((size, 1))
+    signs = Signs(low, high, on & (known != 0), none, (n + 1.0) * one, PATIENCE * one, none)
+    forces, holds, rows = np.zeros(b.shape), np.zeros(b.shape, dtype=bool), np.arange(size)
+    for _ in range(_MAX_ROUNDS):
+        if not len(rows):
+            return forces, holds
+        signs, forces[rows], holds[rows], going = (rounds or _round)(problem, signs)
+        left = going[:, 0] != 0
+        if not left.all():
+            rows = rows[left]
+            problem = Problem._make(None if x is None else x[left] for x in problem)
+            signs = Signs._make(x[left] for x in signs)
+    raise NumericalError(_UNDECIDED.format(n=n))
+
+
+def _round(problem: Problem, signs: Signs) -> tuple[Signs, Any, Any, Any]:
+    return exchange(ARRAYS, problem, signs, problem.b.shape[1])
 
 
 class Jumps(AddedForce):
@@ -301,13 +226,31 @@ class Jumps(AddedForce):
         A, b, on = A.reshape(-1, n, n), b.reshape(-1, n), resting.reshape(-1, n)
         bound, less = (np.broadcast_to(x, on.shape) for x in (law.bound, law.just_moving))
         known = np.zeros(on.shape) if leaving is None else (-leaving * law.just_moving).reshape(on.shape)
-        definite = not self._constrained
-        forces, holds = jump_forces(A, b, bound, less, on, known, definite=definite)
+        definite, forces, holds = not self._constrained, np.zeros(on.shape), np.zeros(on.shape, dtype=bool)
+        w = self.law.which
+        rounds = self._rounds(dyn) if definite and len(b) > 1 else None
+        given: Any = A[:, w[:, None], w], *(x[:, w] for x in (b, bound, less, on, known))
+        forces[:, w], holds[:, w] = jump_forces(*given, definite=definite, rounds=rounds)
         # A has the rounding of M; what the engine's own accelerations still leave corrects that.
         left = accelerate(tau + padded(forces.reshape(shape), tau))
         left = np.asarray(left, dtype=np.float64).reshape(on.shape)
-        forces = forces - _restricted(A, left, holds, definite=definite)
+        forces = forces - restricted(A, left, holds, definite=definite)
         return forces.reshape(shape), holds.reshape(shape)
+
+    def _rounds(self, dyn: Any) -> Callable[[Problem, Signs], tuple[Signs, Any, Any, Any]] | None:
+        """Return machine code of some rounds of exchanges, None where there is none."""
+        if not (dyn._derived and getattr(dyn, "_compiles_steps", False)):
+            return None
+        from mbkit.derivation.steps.exchanges import exchange_rounds
+
+        code = dyn._code("exchange_rounds", make=lambda: exchange_rounds(len(self.law.which)))
+
+        def run(p: Problem, s: Signs) -> tuple[Signs, Any, Any, Any]:
+            out = code(p.A.reshape(len(p.A), -1), *p[2:8], *s[:6], threads=dyn.threads)
+            *signs, forces, holds, going = (x[..., 0] for x in out)
+            return Signs._make([*signs, s.before]), forces, holds, going
+
+        return run
 
     def directions(self, dyn: Any, q: Array) -> Array:
         """Return a basis of the velocities that constraints allow at configurations, (nv, k) or (N, nv, k)."""
@@ -327,7 +270,7 @@ class Jumps(AddedForce):
             return out
         # A joint that loops hold responds by rounding alone, of either sign; the least response keeps A definite.
         masses, own = (np.einsum("...ii->...i", x) for x in (M, out))
-        own[...] = np.maximum(own, _PROXIMAL_SHIFT / np.where(masses > 0, masses, np.inf))
+        own[...] = np.maximum(own, PROXIMAL_SHIFT / np.where(masses > 0, masses, np.inf))
         return np.asarray(0.5 * (out + out.mT))
 
     def phase(self, dyn: Any, sides: Array, still: Mask) -> Any:

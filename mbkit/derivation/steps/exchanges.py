@@ -1,0 +1,61 @@
+"""Rounds of exchanges between joints that rest and that move (`mbkit.methods.exchanges`) as CasADi functions."""
+
+from __future__ import annotations
+
+from functools import reduce
+from typing import Any, Final
+
+import casadi as ca
+
+from mbkit.derivation.steps.symbols import choose
+from mbkit.methods.exchanges import Operations, Problem, Signs, exchange
+
+#: Rounds of one call.
+_ROUNDS: Final = 3
+
+
+def restricted(A: Any, right: Any, on: Any) -> Any:
+    """Return the x with A x = right in the entries that are on, and zero in the others, of a definite A."""
+    n = right.numel()
+    a = [[A[i, j] * on[i] * on[j] + (1 - on[i]) * (i == j) for j in range(i + 1)] for i in range(n)]
+    x = [right[i] * on[i] for i in range(n)]
+    for j in range(n):
+        for i in range(j + 1, n):
+            factor = a[i][j] / a[j][j]
+            x[i] = x[i] - factor * x[j]
+            for k in range(j + 1, i + 1):
+                a[i][k] = a[i][k] - factor * a[k][j]
+    for i in reversed(range(n)):
+        x[i] = (x[i] - sum(a[k][i] * x[k] for k in range(i + 1, n))) / a[i][i]
+    return ca.vertcat(*x)
+
+
+def _behind(x: Any) -> Any:
+    return reduce(lambda sums, entry: ca.vertcat(entry + sums[0], sums), reversed(ca.vertsplit(x)[:-1]), x[-1])
+
+
+COLUMNS: Final = Operations(
+    times=ca.mtimes,
+    solved=restricted,
+    total=ca.sum1,
+    largest=lambda x: reduce(ca.fmax, ca.vertsplit(x)),
+    behind=_behind,
+    choose=choose,
+    size=ca.fabs,
+    sign=ca.sign,
+)
+
+
+def exchange_rounds(n: int) -> ca.Function:
+    """Return (A by rows, b, bound, less, on, known, noise, signs) -> (signs, forces, holds, going) after some rounds.
+
+    A is definite, so that there is no last point among the signs.
+    """
+    given = [ca.SX.sym(name, n) for name in Problem._fields[2:8]]
+    square, state = ca.SX.sym("A", n * n), [ca.SX.sym(name, n) for name in Signs._fields[:4]]
+    state += [ca.SX.sym(name) for name in Signs._fields[4:6]]
+    A = ca.reshape(square, n, n)
+    problem, signs, out = Problem._make([A, A, *given, None]), Signs._make([*state, ca.SX(n, 1)]), list[Any]()
+    for _ in range(_ROUNDS):
+        signs, *out = exchange(COLUMNS, problem, signs, n)
+    return ca.Function("exchange_rounds", [square, *given, *state], [ca.densify(x) for x in (*signs[:6], *out)])
