@@ -25,7 +25,7 @@ from mbkit.load.xml_reader import reserved, unused
 from mbkit.model import Body, Joint, Model, ModelBuilder, kind_of
 from mbkit.model.elements.kinds import joint_types
 from mbkit.model.elements.paths import Path
-from mbkit.model.validation import body_fault
+from mbkit.model.validation import body_fault, listing
 
 _AXES: Final = dict(zip("XYZ", np.eye(3), strict=True))
 _ALIGNED: Final = {"R": "revolute", "P": "prismatic", "RUB": "continuous", "H": "helical"}
@@ -125,8 +125,8 @@ class _Conversion:
             formulas = ", ".join(f"{name} = {m.ratio:g} {m.joint} {m.offset:+g}" for name, m in mimics)
             notes.append(f"mimic joints {how}: {formulas}")
         if healed:
-            several = "; ".join(healed[:5]) + (f"; and {len(healed) - 5} more" if len(healed) > 5 else "")
-            notes.append(f"links of inconsistent inertia, sound together with the links fixed to them: {several}")
+            together = listing(healed)
+            notes.append(f"links of inconsistent inertia, sound together with the links fixed to them: {together}")
         notes += [f"link {x!r} is called {n!r} here, because 'world' is the ground" for x, n in self.names.items()]
         for note in notes if self.snap.note is None else [*notes, self.snap.note]:
             self.b.note(note)

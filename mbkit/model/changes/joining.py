@@ -15,6 +15,7 @@ from mbkit.model.builder import MAX_LENGTH, ModelBuilder, expect_model
 from mbkit.model.elements.paths import OF_BODIES, Path
 from mbkit.model.elements.references import KINDS_OF_PARTS, entries, hung_on
 from mbkit.model.model import Model
+from mbkit.model.validation import listing
 
 JOIN: Final = Path("join", "join: not known of", OF_BODIES)
 #: Kinds of parts that share one set of names each.
@@ -136,7 +137,7 @@ def _require_other_names(base: Model, parts: dict[str, list[Any]], prefix: str) 
         there = {x.name for kind in kinds for x in getattr(base, kind)}
         both = [x.name for kind in kinds for x in parts[kind] if x.name in there]
         if both:
-            more = f" and {len(both) - 1} more" if len(both) > 1 else ""
+            named = listing([repr(x) for x in both], 1)
             raise InputError(
-                f"prefix: with {prefix!r} both models have {kinds[0]} of the name {both[0]!r}{more}; give another one"
+                f"prefix: with {prefix!r} both models have {kinds[0]} of the name {named}; give another one"
             )

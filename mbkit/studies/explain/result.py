@@ -8,18 +8,17 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar
 
 from mbkit._check import by_key
 from mbkit._escape import one_line
+from mbkit.engines.base import MAX_NAMES
+from mbkit.model.validation import listing
 from mbkit.studies.document import Block, Bullet, Column, Document, Items, Section, Span, Style, Table
 from mbkit.studies.explain.joint_matching import Match
 from mbkit.studies.explain.terms import WHOLE, Gap
 from mbkit.studies.formatting import error_text
 from mbkit.studies.results import ResultTable, columns_of
-
-#: More causes of one kind than this are one line.
-_MAX_LINES: Final = 3
 
 
 @dataclass(frozen=True)
@@ -102,8 +101,7 @@ class Explanation(ResultTable):
     @property
     def verdict(self) -> str:
         """One sentence: the same, or why not."""
-        more = f" (and {len(self.beside) - _MAX_LINES} more)" if len(self.beside) > _MAX_LINES else ""
-        return self._of_terms + (f"; {', '.join(self.beside[:_MAX_LINES])}{more}" if self.beside else "")
+        return self._of_terms + (f"; {listing(self.beside, MAX_NAMES)}" if self.beside else "")
 
     @property
     def _of_terms(self) -> str:
@@ -166,8 +164,7 @@ class Explanation(ResultTable):
 
     def __repr__(self) -> str:
         reasons = [f"{c.says} ({effect(c)})" for c in self.acting]
-        more = [f"and {len(reasons) - _MAX_LINES} more"] if len(reasons) > _MAX_LINES else []
-        return f"<Explanation: {one_line('; '.join([self.verdict, *reasons[:_MAX_LINES], *more]))}>"
+        return f"<Explanation: {one_line('; '.join(filter(None, (self.verdict, listing(reasons, MAX_NAMES)))))}>"
 
 
 def _counted(n: int, what: str) -> str:
@@ -188,7 +185,7 @@ def grouped(causes: Iterable[Cause]) -> list[tuple[str, str, str]]:
     """Return kind, sentence and effect of each cause; more than three of one kind are one line."""
     out = []
     for (kind, _), some in by_key(((c.kind, c.acts), c) for c in causes).items():
-        if len(some) <= _MAX_LINES:
+        if len(some) <= MAX_NAMES:
             out += [(kind, c.says, effect(c)) for c in some]
             continue
         largest = max(some, key=lambda c: max(c.effects.values(), default=0.0))

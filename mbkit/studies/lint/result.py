@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Final
 
 from mbkit._check import by_key
+from mbkit.engines.base import MAX_NAMES
 from mbkit.model.validation import listing
 from mbkit.studies.document import Bullet, Column, Document, Items, Section, Span, Style, Table
 from mbkit.studies.results import ResultTable, columns_of, counted
@@ -17,8 +18,6 @@ LIKELY: Final = "likely"
 LOOK: Final = "look"
 SURENESS: Final = (SURE, LIKELY, LOOK)
 _STYLES: Final[dict[str, Style]] = {SURE: "bad", LIKELY: "allowed", LOOK: "muted"}
-#: Parts of one finding that are named.
-_MAX_NAMES: Final = 3
 #: Facts that are never judged, since nothing in the file contradicts them.
 UNSEEN: Final = "what one file cannot show: the sign of an axis, the mass of the whole, where a joint's zero is"
 
@@ -82,7 +81,7 @@ class LintResult(ResultTable):
 
     def document(self, *, full: bool = True) -> Document:
         """Return the document of the findings; parts with the same finding share a line, which names a few or all."""
-        most = len(self.rows) if full else _MAX_NAMES
+        most = len(self.rows) if full else MAX_NAMES
         groups = by_key(((row.check, row.confidence, row.message, row.expected), row) for row in self.rows)
         columns = (
             Column("link or joint", lambda rows: Span(listing([row.part for row in rows], most), "mono")),

@@ -12,7 +12,9 @@ from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 
 from mbkit._check import real
+from mbkit.engines.base import MAX_NAMES
 from mbkit.errors import require_known
+from mbkit.model.validation import listing
 from mbkit.studies import document as doc
 from mbkit.studies.document import Bullet, Column, Document, Items, Paragraph, Section, Span, Table
 from mbkit.studies.formatting import setting_words, time_text
@@ -27,11 +29,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: A terminal names so many methods that were wrong in silence, and so many cases of each.
+#: A terminal names so many methods that were wrong in silence.
 _MAX_SILENT_METHODS: Final = 6
-_MAX_PLACES: Final = 2
-#: Names in one sentence; the tables have all.
-_MAX_NAMES: Final = 3
 #: The words before a truth's floor.
 _KNOWN: Final = "; known to "
 _MEASURES: Final = {
@@ -240,8 +239,8 @@ def _leaders(cases: Iterable[CaseResult]) -> str:
         return f"nothing held in {counted(len(ranked), 'case')}"
     most = max(counts.values())
     names = [name for name, count in counts.items() if count == most]
-    if len(names) > _MAX_NAMES:
-        names = [*names[:_MAX_NAMES], f"{len(names) - _MAX_NAMES} more"]
+    if len(names) > MAX_NAMES:
+        names = [*names[:MAX_NAMES], f"{len(names) - MAX_NAMES} more"]
     listed = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
     return f"{listed} held furthest, or as far as any, in {most} of {counted(len(ranked), 'case')}"
 
@@ -274,8 +273,7 @@ def _silent_bullets(cases: Iterable[CaseResult]) -> list[Bullet]:
     out = []
     for method, found in sorted(where.items(), key=lambda item: -len(item[1])):
         texts = [f"{c.name} at {c.parameter} = {_value_text(c.values[at], c)}" for c, at in found.values()]
-        more = [f"{len(texts) - _MAX_PLACES} more"] if len(texts) > _MAX_PLACES else []
-        out.append(Bullet(method, ", ".join(texts[:_MAX_PLACES] + more), "✗", "bad"))
+        out.append(Bullet(method, listing(texts, MAX_NAMES), "✗", "bad"))
     return out
 
 
