@@ -20,6 +20,7 @@ from scipy.optimize import brentq
 import mbkit as mb
 from mbkit.errors import DoubtfulRunWarning, MbkitWarning
 from mbkit.model import Model
+from mbkit.simulate.solvers.in_phases import moreau
 
 ADAPTIVE = {"rtol": 1e-11, "atol": 1e-12}
 
@@ -522,9 +523,9 @@ def test_states_within_a_step_across_a_singular_pose_are_those_of_the_motion(met
     assert quad(lambda x: 1 / speed(x), run.q[-1, crank], 0.5)[0] == pytest.approx(0.7, rel=1e-7)
 
 
-@pytest.mark.parametrize("count", [1, 3])
-def test_moreau_s_steps_tell_the_singular_pose_that_they_pass(count: int) -> None:
-    dyn = mb.dynamics(parallelogram((0.05,) * 3, 0.05), "lagrangian")
+@pytest.mark.parametrize(("count", "compiled"), [(1, True), (3, False)])
+def test_moreau_s_steps_tell_the_singular_pose_that_they_pass(count: int, compiled: bool) -> None:
+    dyn = mb.dynamics(parallelogram((0.05,) * 3, 0.05), "lagrangian", compile=compiled)
     q, v = turned(dyn.model, 0.1), -3.0 * turned(dyn.model, 1.0)
     speeds = np.linspace(1.0, 0.0, count)[:, None]
     states = (q, v) if count == 1 else (np.repeat(q[None], count, axis=0), speeds * v)
@@ -640,7 +641,7 @@ def test_bounds_that_differ_by_14_decades_are_refused_by_name_where_the_large_on
 
 
 @pytest.mark.thorough("pinocchio")
-@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "compiled"])
 def test_moreau_s_steps_pass_dead_centres(engine: str) -> None:
     """The rocker turns while the others go on; a rate of the rows that is not zero would let all three never rest."""
     b = mb.ModelBuilder("free", gravity=(0, 0, 0))
@@ -664,7 +665,7 @@ def test_moreau_s_steps_pass_dead_centres(engine: str) -> None:
         truth, q, v, 1.02, "rk853", save=np.concatenate([[0], times[::-1], times[::-1] + h * steps]), **ADAPTIVE
     )
     starts, ends = slice(1, 42), slice(42, 83)
-    few = simulated(mb.dynamics(model, engine), run.q[starts], run.v[starts], steps * h, "moreau", dt=h)
+    few = simulated(dynamics(model, engine), run.q[starts], run.v[starts], steps * h, "moreau", dt=h)
     assert np.abs(few.q[:, -1] - run.q[ends]).max() < 1e-5
     assert np.abs(few.v[:, -1] - run.v[ends]).max() < 1e-3
 
@@ -764,7 +765,8 @@ def started(speeds: list[float]) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.thorough(every=3)
 @pytest.mark.parametrize(
-    ("method", "engine"), [(x, "lagrangian") for x in ("rk4", "gauss4", "moreau")] + [("rk4", "compiled")]
+    ("method", "engine"),
+    [(x, "lagrangian") for x in ("rk4", "gauss4", "moreau")] + [("rk4", "compiled"), ("moreau", "compiled")],
 )
 def test_members_of_a_batch_slide_stop_and_rest_as_they_do_alone(method: str, engine: str) -> None:
     dyn, tau = (
@@ -820,6 +822,59 @@ def rubbing(name: str, seed: int, **options: bool) -> tuple[Any, np.ndarray, np.
     joints = tuple(replace(j, friction=f, stiction=1.3 * f) if j.type.nv else j for j, f in numbers)
     dyn = mb.dynamics(replace(b, joints=joints), "lagrangian", **options)
     return dyn, *dyn.model.random_state(rng)
+
+
+@pytest.mark.thorough("five_bar", "chaplygin_sleigh")
+@pytest.mark.parametrize("name", ["five_bar", "double_cardan_shaft", "chaplygin_sleigh"])
+def test_moreau_s_steps_beside_rows_in_machine_code_are_those_in_python(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dyn, q, v = rubbing(name, 3, compile=True)
+    tau = 0.3 * np.random.default_rng(0).standard_normal((60, dyn.model.nv))
+    monkeypatch.delattr(moreau._Stepper, "__call__")
+    run = simulated(dyn, q, v, 0.0595, "moreau", dt=1e-3, torque=tau)
+    monkeypatch.undo()
+    monkeypatch.setattr(moreau, "_compiles", lambda _: False)
+    other = simulated(dyn, q, v, 0.0595, "moreau", dt=1e-3, torque=tau)
+    assert np.abs(run.q - other.q).max() < 1e-13
+    assert np.abs(run.v - other.v).max() < 1e-12
+    np.testing.assert_array_equal(run.v == 0, other.v == 0)
+
+
+def test_moreau_s_steps_in_machine_code_follow_a_table_that_is_shaken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(moreau._Stepper, "__call__")
+    run = simulated(dynamics(shaken(), "compiled"), [0.0, 0.0], [1.5, 0.0], 1.0, "moreau", dt=5e-4)
+    loose = np.arcsin(3.0 / 1.5 / 4.5) / 3
+    turn = brentq(lambda t: slid(loose, t, 1.0)[1], loose + 0.5, 2.0, xtol=1e-14)
+    assert turn > 1
+    assert run.q[-1] == pytest.approx([0.5 * np.sin(3.0), slid(loose, 1.0, 1.0)[0]], abs=2e-3)
+    assert run.v[-1] == pytest.approx([1.5 * np.cos(3.0), slid(loose, 1.0, 1.0)[1]], abs=3e-3)
+    rests = run.t < loose - 1e-3
+    assert (run.q[rests, 1] == 0).all()
+
+
+def test_moreau_s_steps_in_machine_code_end_where_friction_has_taken_the_energy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A crank and a slider, whose friction at any pose is known: without gravity all of T goes into it."""
+    friction, start, speed = np.array([0.4, 0.3, 3.0]), 0.4, 5.0
+    b = mb.ModelBuilder.of(slider_crank(*friction))
+    b.set_gravity((0, 0, 0))
+    dyn, (q, slope) = mb.dynamics(b.build(), "lagrangian", compile=True), crank_pose(start)
+    monkeypatch.delattr(moreau._Stepper, "__call__")
+
+    def left(theta: float) -> float:
+        lost = quad(lambda x: friction @ np.abs(crank_pose(x)[1]), start, theta, points=[np.pi], epsabs=1e-12)[0]
+        return float(crank_energies(start)[0] * speed**2 - lost)
+
+    end, far = brentq(left, start, start + 6.0, xtol=1e-12), []
+    for h in (1e-3, 5e-4):
+        run = simulated(dyn, q, speed * slope, 2.0, "moreau", dt=h)
+        assert (run.v[-1] == 0).all()
+        far.append(run.q[-1, 0] - end)
+    assert abs(far[0]) < 5e-3
+    # The order is one.
+    assert far[1] / far[0] == pytest.approx(0.5, abs=0.1)
 
 
 @pytest.mark.thorough("planar_3rrr")

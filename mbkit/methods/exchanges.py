@@ -139,6 +139,6 @@ def exchange(o: Operations, p: Problem, s: Signs, n: int) -> tuple[Signs, Any, A
         side,
         o.choose(settled, n + 1.0, o.choose(fewer, count, s.best)),
         o.choose(settled + fewer > 0, PATIENCE, s.left - (s.left > 0)),
-        s.before if p.shift is None else o.choose(settled, x * near, s.before),
+        s.before if p.shift is None else o.choose(settled, x * (1 - again), s.before),
     )
     return signs, forces, held * (1 - moves), 1 - settled * (1 - near) * (1 - again)

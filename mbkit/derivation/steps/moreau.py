@@ -13,7 +13,7 @@ Forces that hold joints at rest, as expressions of a model whose joints slide or
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import Any, Final
 
@@ -21,8 +21,11 @@ import casadi as ca
 import numpy as np
 
 from mbkit.derivation.equations import Equations
+from mbkit.derivation.steps.exchanges import COLUMNS
 from mbkit.derivation.steps.fixed import Part, function_of
+from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, projection, rows_change
 from mbkit.derivation.steps.symbols import SymbolicSpace, choose
+from mbkit.methods.exchanges import FORCE_ROUNDING, PATIENCE, PROXIMAL_SHIFT, Problem, Signs, exchange
 from mbkit.model.parts import POSE_ROUNDING, RESTING, ROUNDING, STOPPED
 
 
@@ -96,63 +99,98 @@ def _shared(ways: Any, needed: Any, bound: Any, still: Any, locked: Any) -> Any:
     return ca.mtimes(links, part) + choose(ca.sum2(links) > 1, np.nan, 0.0)
 
 
-#: A round reads these and writes the same names with a 1 behind. `side` and `still` are of the velocities whose
-#: forces jump; `k` is the number of steps so far, `end` that to make; `best` is the least number of failures so far and
-#: `left` how many attempts may fail to have fewer; `go` is 1 while there are steps to make.
+#: Names of what a round reads, and writes with a 1 behind. `side` and `still` are of the velocities whose forces jump;
+#: `k` is the number of steps so far, `end` that to make; `best` is the least number of failures so far and `left` how
+#: many attempts may fail to have fewer; `go` is 1 while there are steps to make.
 STATE: Final = ("q", "w", "side", "still", "k", "end", "best", "left", "go")
-#: Attempts that may not have fewer failures before sides are changed one by one.
-PATIENCE: Final = 3
+#: The same beside constraints: `low` and `high` are the bounds now and `before` is the last proximal point of
+#: `mbkit.methods.exchanges`, `depends` the `dependence` of rows a step ago and `new` is 1 where a step begins.
+HELD_STATE: Final = ("q", "w", "side", "still", "low", "high", "before", "depends", "new", *STATE[4:])
+#: Rounds of exchanges in one attempt: as many as proximal points take.
+_EXCHANGES: Final = 2
 #: `best` beyond every velocity: no candidate yet.
 MANY: Final = 1e9
+
+
+class _Attempt:
+    """Symbols of an attempt: what a round reads, and the parameters of a step with given sides and rotors at rest."""
+
+    def __init__(
+        self, equations: Equations, which: list[int], sides: list[str], locks: list[str], state: Sequence[str]
+    ) -> None:
+        model, n, nv = equations.model, len(which), equations.model.nv
+        self.equations, self.space, self.n, self.nv = equations, SymbolicSpace(model), n, nv
+        sizes = dict.fromkeys(("side", "still", "low", "high", "before", "bound"), n) | {"q": model.nq, "w": nv}
+        sizes |= {"tau": equations.force.numel()}
+        self.s = s = {name: ca.SX.sym(name, sizes.get(name, 1)) for name in (*state, "tau", "dt", "bound")}
+        rest = [name for name in model.parameters if name not in {*sides, *locks}]
+        others = ca.SX.sym("parameters", len(rest))
+        self.extra = {"parameters": others} if rest else {}
+        # The time is that of step zero, if all steps had this length.
+        self._at_step = [
+            x + s["k"] * s["dt"] if name == model.time_parameter else x
+            for name, x in zip(rest, ca.vertsplit(others), strict=True)
+        ]
+        self._timed = [name == model.time_parameter for name in rest]
+        place = {name: i for i, name in enumerate((*sides, *locks, *rest))}
+        self._order = [place[name] for name in model.parameters]
+        self.pick = ca.DM(ca.Sparsity.triplet(n, nv, list(range(n)), which), 1.0)
+
+    def spread(self, x: Any) -> Any:
+        """Return numbers of the velocities that may rest among all."""
+        return ca.mtimes(self.pick.T, x)
+
+    def parameters(self, side: Any = None, lock: Any = None, later: Any = 0.0) -> Any:
+        """Return the parameters of a step so long after its start; without sides and rotors nothing jumps."""
+        none = ca.SX.zeros(self.n)
+        rest = [x + later if timed else x for x, timed in zip(self._at_step, self._timed, strict=True)]
+        return ca.vertcat(none if side is None else side, none if lock is None else lock, *rest)[self._order]
+
+    def part(self, name: str, reads: Sequence[str], writes: Sequence[str], make: Callable[..., Sequence[Any]]) -> Part:
+        """Return a part; `make` gets what other parts write, in the order of the names that it reads."""
+        given = {x: (self.s | self.extra).get(x) for x in reads}
+
+        def function() -> ca.Function:
+            sizes = {
+                "a": self.nv,
+                "needed": self.n,
+                "free": self.nv,
+                "A": self.nv * self.n,
+                "slides": self.n,
+                "least": self.n,
+            }
+            sizes |= dict.fromkeys(("forces", "holds", "side_", "still_", "low_", "high_", "before_"), self.n)
+            own = {x: ca.SX.sym(x, sizes.get(x, 1)) if y is None else y for x, y in given.items()}
+            made = make(*(own[x] for x, y in given.items() if y is None))
+            return function_of(name, own, dict(zip(writes, made, strict=True)))
+
+        return Part(name, tuple(reads), tuple(writes), function)
 
 
 def moreau_parts(equations: Equations, which: list[int], sides: list[str], locks: list[str]) -> list[Part]:
     """Return the parts of an attempt, of the equations of a model whose joints slide or rest as parameters say.
 
     `which` are the velocities whose forces jump, `sides` and `locks` the parameters of their sides and of their rotors
-    at rest. The parts read `STATE`, tau, dt, bound (the largest forces at rest, in the order
-    of `which`) and the other parameters.
+    at rest. The parts read `STATE`, or `HELD_STATE` of a model with constraints, tau, dt, bound (the largest forces at
+    rest, in the order of `which`) and the other parameters.
     """
-    model, space = equations.model, SymbolicSpace(equations.model)
-    n, nv = len(which), model.nv
-    s = {name: ca.SX.sym(name, size) for name, size in (("q", model.nq), ("w", nv), ("side", n), ("still", n))}
-    s |= {name: ca.SX.sym(name) for name in STATE[4:]}
-    s |= {"tau": ca.SX.sym("tau", equations.force.numel()), "dt": ca.SX.sym("dt"), "bound": ca.SX.sym("bound", n)}
-    rest = [name for name in model.parameters if name not in {*sides, *locks}]
-    others = ca.SX.sym("parameters", len(rest))
-    # The time is that of step zero, if all steps had this length.
-    at_step = [
-        x + s["k"] * s["dt"] if n == model.time_parameter else x
-        for n, x in zip(rest, ca.vertsplit(others), strict=True)
-    ]
-    place = {name: i for i, name in enumerate((*sides, *locks, *rest))}
-    order = [place[name] for name in model.parameters]
-    pick = ca.DM(ca.Sparsity.triplet(n, nv, list(range(n)), which), 1.0)
+    if equations.model.constrained:
+        return _held_parts(_Attempt(equations, which, sides, locks, HELD_STATE))
+    own = _Attempt(equations, which, sides, locks, STATE)
+    s, space, pick, spread = own.s, own.space, own.pick, own.spread
     v, h, still, side = space.to_body_velocity(s["q"], s["w"]), s["dt"], s["still"], s["side"]
 
-    def spread(x: Any) -> Any:
-        """Return numbers of the velocities that may rest among all."""
-        return ca.mtimes(pick.T, x)
-
-    def parameters(side: Any, lock: Any) -> Any:
-        return ca.vertcat(side, lock, *at_step)[order]
-
-    def solve() -> ca.Function:
+    def solve() -> tuple[Any, Any]:
         # A joint that comes to rest is accelerated so that it has no velocity at the end: a force on a giant rotor.
         target = -ca.mtimes(pick, v) / h
-        force = s["tau"] + ca.vertcat(spread(RESTING * still * target), ca.SX(s["tau"].numel() - nv, 1))
+        force = s["tau"] + ca.vertcat(spread(RESTING * still * target), ca.SX(s["tau"].numel() - own.nv, 1))
         forward = equations.function("forward_dynamics")
-        a = forward(s["q"], v, force, parameters(side * (1 - still), RESTING * still))
+        a = forward(s["q"], v, force, own.parameters(side * (1 - still), RESTING * still))
         a = (1 - spread(still)) * a + spread(still * target)
-        needed = holding(equations, s["q"], v, a, s["tau"], parameters(side * (1 - still), ca.SX(n, 1)))
-        given = {name: s[name] for name in first[: -len(extra) or None]} | extra
-        return function_of("moreau_solve", given, {"a": a, "needed": ca.mtimes(pick, needed)})
+        needed = holding(equations, s["q"], v, a, s["tau"], own.parameters(side * (1 - still)))
+        return a, ca.mtimes(pick, needed)
 
-    extra = {"parameters": others} if others.numel() else {}
-    first = ("q", "w", "side", "still", "k", "tau", "dt", *extra)
-    a, needed = ca.SX.sym("a", nv), ca.SX.sym("needed", n)
-
-    def decide() -> ca.Function:
+    def decide(a: Any, needed: Any) -> list[Any]:
         after = v + h * a
         after = (1 - spread(still)) * after
         along = ca.mtimes(pick, after)
@@ -164,33 +202,133 @@ def moreau_parts(equations: Equations, which: list[int], sides: list[str], locks
         fewer = count < s["best"]
         best, left = choose(fewer, count, s["best"]), choose(fewer, PATIENCE, s["left"] - (s["left"] > 0))
         alone = (1 - fewer) * (s["left"] <= 0)
-        later, last = ca.SX(0), []
-        for k in reversed(range(n)):
-            last.append(wrong[k] * (later <= 0))
-            later = later + wrong[k]
-        change = choose(alone, ca.vertcat(*reversed(last)), wrong)
+        change = choose(alone, wrong * (COLUMNS.behind(wrong) == 1), wrong)
         new_still = choose(change, 1 - still, still)
         new_side = choose(change * loose, -ca.sign(needed), side)
         good = count <= 0
         q1 = space.retract(s["q"], h * space.to_integrator_velocity(s["q"], after))
         w1 = space.to_integrator_velocity(q1, after)
         k = s["k"] + good
-        state = {
-            "q1": choose(good, q1, s["q"]),
-            "w1": choose(good, w1, s["w"]),
-            "side1": choose(good, side, new_side),
-            "still1": choose(good, still, new_still),
-            "k1": k,
-            "end1": s["end"],
-            "best1": choose(good, MANY, best),
-            "left1": choose(good, PATIENCE, left),
-            "go1": k < s["end"],
-        }
-        given = {name: s[name] for name in (*STATE[:-1], "dt", "bound")} | {"a": a, "needed": needed}
-        return function_of("moreau_decide", given, state)
+        new = (q1, w1, side, still, k, s["end"], MANY, PATIENCE)
+        old = (s["q"], s["w"], new_side, new_still, k, s["end"], best, left)
+        return [*(choose(good, x, y) for x, y in zip(new, old, strict=True)), k < s["end"]]
 
+    first = ("q", "w", "side", "still", "k", "tau", "dt", *own.extra)
     second = (*STATE[:-1], "dt", "bound", "a", "needed")
     return [
-        Part("moreau_solve", first, ("a", "needed"), solve),
-        Part("moreau_decide", second, tuple(f"{name}1" for name in STATE), decide),
+        own.part("moreau_solve", first, ("a", "needed"), solve),
+        own.part("moreau_decide", second, tuple(f"{name}1" for name in STATE), decide),
     ]
+
+
+def _held_parts(own: _Attempt) -> list[Part]:
+    """Return the parts of an attempt beside constraints: exchanges in their responses, and a projection at its end.
+
+    Rows hold the velocity at the end of the step: else no velocities of what rests together may be zero. `go` is 0,
+    with fewer than `end` steps, where a step is lost, as a singular pose is near.
+    """
+    equations: Any = own.equations
+    s, space, n, nv = own.s, own.space, own.n, own.nv
+    v, h, on = space.to_body_velocity(s["q"], s["w"]), s["dt"], s["bound"] > 0
+    terms, factors, more = equations.constraints, equations.constraint_factors, [*equations.extra_arguments.values()]
+
+    def at(parameters: Any) -> list[Any]:
+        return [parameters] if more else []
+
+    def free() -> list[Any]:
+        now, later = at(own.parameters()), at(own.parameters(later=h))
+        smooth = v + h * equations.function("forward_dynamics")(s["q"], v, s["tau"], *now)
+        rate = ca.Function("rate", [equations.q, equations.v, *more], [ca.densify(terms.rate)])
+        smooth = smooth + rows_change(equations)(s["q"], rate(s["q"], smooth, *later), *later)
+        A, _ = factors.motion(own.pick.T, ca.SX.zeros(terms.jacobian.shape[0], n))
+        masses = ca.mtimes(own.pick, ca.diag(equations.mass_matrix))
+        least = choose(masses > 0, PROXIMAL_SHIFT / masses, 0.0)
+        A, least = ca.Function("responses", [equations.q, *more], [ca.densify(A), least])(s["q"], *later)
+        passive = ca.Function("passive", [equations.q, equations.v, *more], [ca.densify(equations.passive)])
+        rubs = (passive(s["q"], v, *at(own.parameters(ca.SX.ones(n) * x))) for x in (0.0, 1.0))
+        slides = ca.fabs(ca.mtimes(own.pick, -reduce(lambda x, y: y - x, rubs)))
+        return [smooth, ca.vec(A), least, slides, dependence(equations)(s["q"], *now)]
+
+    def exchanges(smooth: Any, A: Any, least: Any, slides: Any, _: Any) -> list[Any]:
+        A = ca.mtimes(own.pick, ca.reshape(A, nv, n))
+        # A joint that loops hold responds by rounding alone, of either sign; the least response keeps A definite.
+        A = 0.5 * (A + A.T) + ca.diag(ca.fmax(least - ca.diag(A), 0.0))
+        rests = choose(s["new"], ca.mtimes(own.pick, v) == 0, s["still"])
+        most, less, b = h * choose(rests, s["bound"], slides), h * slides, ca.mtimes(own.pick, smooth)
+        shift = PROXIMAL_SHIFT * ca.fabs(ca.diag(A))
+        noise = FORCE_ROUNDING * (ca.fabs(b) + ca.mtimes(ca.fabs(A), most))
+        problem = Problem(A, A + ca.diag(shift), b, most, less, on, ca.SX.zeros(n), noise, shift)
+        low, high = (choose(s["new"], x, y) for x, y in ((-most, s["low"]), (most, s["high"])))
+        best, left = (choose(s["new"], x, y) for x, y in ((n + 1.0, s["best"]), (PATIENCE, s["left"])))
+        signs = Signs(low, high, ca.SX.zeros(n), s["side"] * on, best, left, s["before"] * (1 - s["new"]))
+        for _ in range(_EXCHANGES):
+            signs, forces, holds, going = exchange(COLUMNS, problem, signs, n)
+        return [signs.side, rests, signs.low, signs.high, signs.before, signs.best, signs.left, forces, holds, going]
+
+    def end(*given: Any) -> list[Any]:
+        smooth, A, least, slides, depends, side, rests, low, high, before, best, left, forces, holds, going = given
+        A = ca.reshape(A, nv, n)
+        along = choose(own.spread(holds), 0.0, smooth + ca.mtimes(A, forces))
+        # A joint that stops or turns may be held by its stiction.
+        turns = on * (1 - rests) * (ca.mtimes(own.pick, v * along) <= 0) * (slides < s["bound"]) * (1 - going)
+        turned = COLUMNS.largest(turns)
+        most = h * choose(rests + turns > 0, s["bound"], slides)
+        q1 = space.retract(s["q"], h * space.to_integrator_velocity(s["q"], along))
+        middle = space.retract(s["q"], 0.5 * h * space.to_integrator_velocity(s["q"], along))
+        later = at(own.parameters(lock=RESTING * locked(ca.mtimes(own.pick, A), least, holds), later=h))
+        onto = projection(equations)
+        _, v1, moved, _ = onto(q1, along, ca.SX.zeros(nv), *later)
+        q1, v1, _, far = onto(q1, v1, moved, *later)
+        q1, v1 = choose(_places(own, holds), s["q"], q1), choose(own.spread(holds), 0.0, v1)
+        between = dependence(equations)(middle, *at(own.parameters(later=0.5 * h)))
+        near = nears_singular(s["depends"], depends) * (s["depends"] > 0)
+        lost = ca.logic_or(ca.logic_or(near, nears_singular(depends, between)), far * (1 - going) * (1 - turned))
+        good = (1 - going) * (1 - turned) * (1 - lost)
+        k = s["k"] + good
+        w1 = space.to_integrator_velocity(q1, v1)
+        new = (q1, w1, side, holds, low, high, before, depends, 1.0, k, s["end"], best, left)
+        low, high, before = (choose(turned, x, y) for x, y in ((-most, low), (most, high), (0.0, before)))
+        best, left = (choose(turned, x, y) for x, y in ((n + 1.0, best), (PATIENCE, left)))
+        old = (s["q"], s["w"], side, rests + turns > 0, low, high, before, s["depends"], 0.0, k, s["end"], best, left)
+        return [*(choose(good, x, y) for x, y in zip(new, old, strict=True)), (k < s["end"]) * (1 - lost)]
+
+    made = ("free", "A", "least", "slides", "depends_now")
+    tried = ("side_", "still_", "low_", "high_", "before_", "best_", "left_", "forces", "holds", "going")
+    changed = ("side", "still", "low", "high", "before", "new", "best", "left")
+    return [
+        own.part("moreau_free", ("q", "w", "k", "tau", "dt", *own.extra), made, free),
+        own.part("moreau_exchanges", ("q", "w", *changed, "dt", "bound", *made), tried, exchanges),
+        own.part(
+            "moreau_end",
+            ("q", "w", "depends", "k", "end", "dt", "bound", *own.extra, *made, *tried),
+            tuple(f"{name}1" for name in HELD_STATE),
+            end,
+        ),
+    ]
+
+
+def locked(A: Any, least: Any, holds: Any) -> Any:
+    """Return as many of the joints that hold, (n,), as rest in independent ways.
+
+    By their responses, (n, n): what responds with the `least` is held by rows already.
+    """
+    n, out = holds.numel(), []
+    a = [[A[i, j] for j in range(i + 1)] for i in range(n)]
+    for j in range(n):
+        out.append(holds[j] * (a[j][j] > ca.fmax(POSE_ROUNDING * A[j, j], least[j])))
+        inverse = choose(out[-1], 1 / a[j][j], 0.0)
+        for i in range(j + 1, n):
+            for k in range(j + 1, i + 1):
+                a[i][k] = a[i][k] - a[i][j] * inverse * a[k][j]
+    return ca.vertcat(*out)
+
+
+def _places(own: _Attempt, holds: Any) -> Any:
+    """Return which coordinates keep their place: joints whose forces jump have one for each velocity."""
+    model, out = own.equations.model, ca.SX.zeros(own.equations.model.nq)
+    moved = own.spread(holds)
+    for joint in model.independent_joints:
+        q, v = model.layout.q[joint.name], model.layout.v[joint.name]
+        if q.stop - q.start == v.stop - v.start:
+            out[q] = moved[v]
+    return out

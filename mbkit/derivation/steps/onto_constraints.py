@@ -114,6 +114,11 @@ def _moved(equations: Any, q: Any, by: Any) -> Any:
     return space.retract(q, space.to_integrator_velocity(q, by))
 
 
+def rows_change(equations: Any) -> ca.Function:
+    """Return (q, residual, more) -> the least change of velocities, in the metric of M, by which all rows lose one."""
+    return _change(equations, rows=equations.constraints.jacobian.shape[0])
+
+
 @kept
 def _change(equations: Any, *, rows: int) -> ca.Function:
     """Return (q, residual, more) -> the least change of velocities, in the metric of M, by which rows lose a residual.

@@ -1,7 +1,7 @@
 """Runs by Moreau and Jean's step: forces that jump with a fixed step, at any number of joints, without events.
 
-On the own derivation the step with its choice of sides is machine code; elsewhere, beside constraints, and under
-torques that are functions, the same problem is solved in Python for each step.
+On the own derivation the step with its choice of sides is machine code; elsewhere, near singular poses of constraints,
+and under torques that are functions, the same problem is solved in Python for each step.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ _UNDECIDED: Final = "which joints rest cannot be decided"
 
 def run_moreau(problem: IntegrationProblem) -> SolverResult:
     """Step one state or a batch over the grid."""
-    dyn, every = problem.dyn, np.arange(len(problem.q))
+    dyn, left = problem.dyn, np.arange(len(problem.q))
     record, reasons = GridRecord(problem), dict[int, str]()
     if _compiles(problem):
-        for i in every.tolist():
+        for i in left.tolist():
             member = problem.member(i)
-            one = _Compiled(problem, dyn if member is None else dyn._of_sample(i), every[[i]], record)
+            one = _Compiled(problem, dyn if member is None else dyn._of_sample(i), left[[i]], record)
             steps, attempts, reasons[i] = one.run()
             record.good[i], record.error = steps, one.error
             record.evaluations += attempts
@@ -49,24 +49,26 @@ def run_moreau(problem: IntegrationProblem) -> SolverResult:
                 break
             if problem.grid.steps:
                 problem.report(i)(problem.end)
-        return record.result(lambda i: reasons[i])
+        # Beside constraints a step is lost where it may be near a singular pose, and Python tells the reason.
+        again = dyn.model.constrained and record.error is None
+        left = left[(record.good < problem.grid.steps) & again]
     together = problem.batch is None or side_by_side(problem)
-    for members in [every] if together else [every[[i]] for i in every]:
+    for members in ([left] if together else [left[[i]] for i in range(len(left))]) if len(left) else ():
         stepper = _Stepper(problem, members)
-        run = SteppedRun(problem, stepper, problem.v0.copy(), record, None if together else members)
+        run = SteppedRun(problem, stepper, problem.v0.copy(), record, members)
         run.to_end()
         reasons |= dict.fromkeys(members.tolist(), run.why)
         record.poses = {**record.poses, **stepper.poses}
+        record.evaluations += int(record.good[members].sum())
         if record.error is not None:
             break
-    record.evaluations = int(record.good.sum())
     return record.result(lambda i: reasons[i])
 
 
 def _compiles(problem: IntegrationProblem) -> bool:
     dyn = problem.dyn
-    plain = dyn._derived and not problem.torque.callable and "jump" in dyn.model.effects and not dyn.model.constrained
-    return plain and bool(getattr(dyn, "_compiles_steps", False))
+    known = dyn._derived and not problem.torque.callable and "jump" in dyn.model.effects
+    return known and bool(getattr(dyn, "_compiles_steps", False))
 
 
 class _Stepper(Stepper):
@@ -141,21 +143,22 @@ class _Compiled:
     def __init__(self, problem: IntegrationProblem, dyn: Dynamics, members: Indices, record: GridRecord) -> None:
         from mbkit.codegen.compiled import aligned
         from mbkit.codegen.step_loop import Arena, compiled_step_loop
-        from mbkit.derivation.steps.moreau import MANY, PATIENCE, STATE, moreau_parts
+        from mbkit.derivation.steps.moreau import HELD_STATE, MANY, STATE, moreau_parts
+        from mbkit.methods.exchanges import PATIENCE
 
         self._problem, self._record, self._i = problem, record, int(members[0])
         phases, sliding = Phases(dyn), dyn._jumps.sliding
         self._force, self._space = problem.torque.of_member(problem.member(self._i)), Space(dyn.model)
         none = np.zeros(dyn.model.nv)
         own: Any = dyn._jumps.phase(dyn, none, none > 0)
-        names = own.model.parameters
+        names, state = own.model.parameters, HELD_STATE if own.model.constrained else STATE
         which, sides, locks = sliding.which.tolist(), [*sliding.sides.values()], [*sliding.locks.values()]
         kept: dict[str, Any] = own.equations.kept
         if problem.method not in kept:
             kept[problem.method] = compiled_step_loop(
-                (own._form, problem.method), lambda: moreau_parts(own.equations, which, sides, locks), STATE
+                (own._form, problem.method), lambda: moreau_parts(own.equations, which, sides, locks), state
             )
-        self._arena = arena = Arena(kept[problem.method], STATE)
+        self._arena = arena = Arena(kept[problem.method], state)
         self._clock: int | None = None
         arena["bound"][:] = dyn._jumps.law_of(dyn).bound[which, None]
         if "parameters" in arena.code.rows:
@@ -164,7 +167,7 @@ class _Compiled:
             self._clock = [*others].index(own.model.time_parameter) if own.model.time_parameter else None
         self._now, self._at = arena.state, arena.at
         q, w = problem.q[self._i], self._space.to_integrator_velocity(problem.q[self._i], problem.v[self._i])
-        self._put(q=q, w=w, best=MANY, left=PATIENCE, go=1.0)
+        self._put(q=q, w=w, best=MANY, left=PATIENCE, go=1.0, **({"new": 1.0} if own.model.constrained else {}))
         self._phases, self._which = phases, which
         self._log = aligned(_ROUNDS * self._now.size).reshape(_ROUNDS, *self._now.shape)
         self._most = _PATIENCE * (len(which) + 1)
@@ -186,7 +189,7 @@ class _Compiled:
             except FunctionError as error:
                 self.error = error
                 return k, attempts, str(error)
-            if not k:
+            if not k and "new" not in self._at:
                 phase = self._phases.phase(grid.start, q, v, self._force(0))
                 self._put(side=phase.sides[self._which], still=phase.still[self._which].astype(float))
             last = k + 1 if held or k == grid.steps - 1 else grid.steps - (grid.step(grid.steps - 1) != grid.dt)
@@ -215,7 +218,8 @@ class _Compiled:
         if not fine.all():
             made, why = int(np.argmin(fine)), DIVERGED
         since = count - 1 - int(good[-1]) if len(good) else since + count
-        if not why and since > self._most:
+        lost = not states[-1, self._at["go"]].any() and k + made < last
+        if not why and (since > self._most or lost):
             why = DIVERGED if not np.isfinite(states[-1]).all() else _UNDECIDED
         self._keep(k, q[:made], w[:made])
         return made, count, since, why
