@@ -11,7 +11,7 @@ from mbkit.lagrangian.description_kinematics import SymbolicKinematics, exact, r
 from mbkit.model.elements.forces import RATE, TIME, JointElement
 from mbkit.model.elements.formula import Arithmetic, completed
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion
-from mbkit.model.parts import Prescribed
+from mbkit.model.parts import rules_of
 
 
 def _select(holds: Any, yes: Any, no: Any) -> Any:
@@ -60,10 +60,9 @@ def law(kin: SymbolicKinematics, part: Motion, t: sp.Symbol) -> sp.Expr:
     numbers = kin.written.values.of(part)
     if hasattr(numbers, "knots"):
         return _pieces(numbers, t)
-    if isinstance(part, Prescribed):
-        numbers.phase = read_angle(numbers.phase)
-        if kin.model.joint(part.joint).type.angular:
-            numbers.offset = read_angle(numbers.offset)
+    units = ("rad", "rad, m") if kin.model.joint(part.joint).type.angular else ("rad",)
+    for name in (n for n, rule in rules_of(type(part)).items() if rule.added and rule.unit in units):
+        setattr(numbers, name, read_angle(getattr(numbers, name)))
     return sp.sympify(MOTION_LAWS[type(part)](part, numbers, t, SYMPY))
 
 

@@ -169,8 +169,8 @@ def _require_numbers(model: Model, part: Any, item: str) -> None:
 
 
 def _refuse_driven(model: Model, values: Values) -> None:
-    if driven := [x.joint for x in motions_of(model) if x.joint in values]:
-        raise InputError(f"joints: {driven[0]!r} is moved by a prescribed motion; remove it with without('prescribed')")
+    if driven := [x for x in motions_of(model) if x.joint in values]:
+        raise InputError(f"joints: {driven[0].joint!r} is moved in time; without({driven[0].section!r}) removes that")
     for b in model.bindings:
         if b.where == "joints" and b.part in values and b.field in ("pitch", "ratio", "offset"):
             raise InputError(
