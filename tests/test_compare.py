@@ -412,7 +412,7 @@ def test_what_the_file_has_and_no_engine_uses_is_told_and_is_no_difference():
     moved = np.linalg.det(M[0]) / M[0, 0, 0]
     assert findings(model, np.ones((1, 2)), M)[2].size == pytest.approx(moved / 200.0)
     assert findings(model, np.full((3, 2), 4.0), M)[0].size == pytest.approx(2.5)
-    assert "position, effort of 2 joints" in limits.says
+    assert "limits, limits of effort at 2 joints" in limits.says
     (changed,) = (o for o in result.omissions if o.need == "dry friction")
     assert changed.change > 0.1
     assert not changed.unchanged

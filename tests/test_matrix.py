@@ -15,6 +15,7 @@ from contextlib import suppress
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -25,6 +26,8 @@ from mbkit.model.elements.kinds import PART_KINDS, Kind, kind, register_kind
 from mbkit.model.elements.paths import PATHS as GATES
 from mbkit.model.elements.paths import Path as Gate
 from mbkit.model.joint_types import KINDS as JOINT_TYPES
+from mbkit.studies.compare.beyond_terms import findings
+from mbkit.studies.compare.terms import LIMITS
 from tests import kind_examples, kind_mutations
 from tests.kind_examples import EXAMPLES, TYPES, Example
 from tests.kind_mutations import seen
@@ -246,6 +249,16 @@ def hook():
 def test_a_new_kind_is_refused_by_name_without_a_column(path: str, hook: Kind) -> None:
     with pytest.raises(UnsupportedError, match="joint 'j0' has a hook"):
         CHECKS[path](EXAMPLES["gravity"]("gravity"))
+
+
+def test_a_limit_of_a_new_kind_is_told_with_the_others(hook: Kind) -> None:
+    """They are data: what says that no engine has them must not forget one."""
+    bound = replace(hook, does=frozenset(["bound"]), features=("limits",))
+    with patch.dict(PART_KINDS, {hook.name: bound}):
+        model = example("joint.limit")
+        (told,) = (x for x in findings(model, np.zeros((1, model.nv)), np.eye(model.nv)[None]) if x.kind == LIMITS)
+    assert told.says.endswith("limits at 1 joint; a hook at 1 joint")
+    assert told.joints == ("x", "j0")
 
 
 #: Paths that ask for a loop.

@@ -25,7 +25,7 @@ from mbkit.engines.registry import DERIVED, MUJOCO, PINOCCHIO
 from mbkit.methods.registry import DEFAULT_METHOD, EULER_METHOD, METHODS
 from mbkit.model import Model
 from mbkit.model.description import LEFT_OUT, SERVOS
-from mbkit.model.elements.kinds import EFFECTS
+from mbkit.model.elements.kinds import EFFECTS, PART_KINDS, kind, that_do
 from mbkit.model.parts import Joint, rules_of
 from mbkit.simulate import Trajectory
 from mbkit.studies.compare.errors import ROUNDINGS, interleaved
@@ -72,10 +72,10 @@ def _largest_jump(model: Model, forces: Array) -> Finding | None:
 
 
 def _limits(model: Model) -> Finding | None:
-    kinds = {"joint.limit": "position", "joint.velocity_limit": "velocity", "joint.effort_limit": "effort"}
-    # Kinds that the same joints have stand together.
-    alike = by_key((model.acts[kind], word) for kind, word in kinds.items() if kind in model.acts)
-    parts = [f"{', '.join(some)} of {counted(len(joints), 'joint')}" for joints, some in alike.items()]
+    # What the same joints have stands together, and a finer kind with its own.
+    there = [x for x in that_do("bound", "joints") if x in model.acts and x.rpartition(".")[0] not in PART_KINDS]
+    alike = by_key((model.acts[x], kind(x).words.rpartition("has ")[2]) for x in there)
+    parts = [f"{', '.join(some)} at {counted(len(joints), 'joint')}" for joints, some in alike.items()]
     if not parts:
         return None
     every = tuple(dict.fromkeys(name for some in alike for name in some))
