@@ -390,6 +390,12 @@ def test_a_choice_that_stays_ends_at_its_singular_pose(rod):
     assert "x no longer" in run.stats.message
     assert run.t[-1] == pytest.approx(0.3071, abs=1e-3)
     assert run.events[-1].name == "near a singular pose"
+    with pytest.warns(MbkitWarning, match="near a singular pose at t = 0.0"):
+        steps = mb.simulate(rod.embedded([x]), *on_circle(1.5, 2.0), 0.1, "rk4", dt=1e-4)
+    assert steps.stats.ended == "step_too_small"
+    assert "x no longer" in steps.stats.message
+    assert steps.t[-1] == steps.stats.reached == steps.events[-1].t
+    assert steps.q[-1, 0] == pytest.approx(1.5, abs=1e-6)
     with pytest.raises(InputError, match="singular pose"):
         mb.simulate(rod.embedded(["x"]), [1.5, 0.0], [0.0, 1.0], 1.0, "rk853")
 

@@ -458,6 +458,29 @@ def test_what_lets_go_at_a_time_of_the_grid_lets_go(method: str) -> None:
     assert run.q[-1, 0] == pytest.approx(exact, rel=1e-2 if method == "semi_implicit_euler" else 1e-9)
 
 
+def test_of_a_batch_each_ends_at_its_own_event_beside_phases() -> None:
+    """x = f/k + (x0 - f/k) cos ωt on the way down: the state of an event between saved times is none of these."""
+    dyn, save = mb.dynamics(slider(friction=3.0), "lagrangian"), np.array([0.0, 0.1, 0.2, 0.25, 0.3, 0.4])
+    passes = mb.simulate.Event(lambda t, q, v: q[0] - 0.1, "passes", direction=-1)  # noqa: ARG005
+    run = mb.simulate(dyn, [[0.2], [0.08]], [0.0], 0.4, "rk853", rtol=1e-12, save=save, events=passes)
+    middle, rate = 3.0 / 50.0, np.sqrt(50.0 / 2.0)
+    end = np.arccos((0.1 - middle) / (0.2 - middle)) / rate
+    exact = middle + (0.2 - middle) * np.cos(rate * save)
+    assert run.q[0, :, 0] == pytest.approx(np.where(save < end, exact, np.nan), rel=1e-9, nan_ok=True)
+    assert np.isfinite(run.q[1]).all()
+    assert (run.stats.reached, run.events[0].t) == (pytest.approx((end, 0.4)), pytest.approx(end))
+
+
+def test_progress_of_phases_is_that_of_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mbkit.simulate.progress._PERIOD", 0.0)
+    told: list[float] = []
+    dyn = mb.dynamics(slider(friction=0.2), "lagrangian")
+    run = mb.simulate(dyn, [[0.2], [0.1]], [0.0], 3.0, "rk853", save=[3.0], progress=told.append)
+    assert len(run.events) > 4
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+
+
 @pytest.mark.parametrize("method", ["rk853", "rk4", "moreau"])
 def test_a_run_of_no_time_is_its_start(method: str) -> None:
     run = mb.simulate(mb.dynamics(slider(friction=3.0), "lagrangian"), [0.5], [1.0], 0.0, method)

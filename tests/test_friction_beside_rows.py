@@ -523,6 +523,26 @@ def test_states_within_a_step_across_a_singular_pose_are_those_of_the_motion(met
     assert quad(lambda x: 1 / speed(x), run.q[-1, crank], 0.5)[0] == pytest.approx(0.7, rel=1e-7)
 
 
+def test_a_run_tells_once_of_the_poses_that_its_phases_pass() -> None:
+    """Upwards through the pose, round, and down through it again, by energy and quadrature."""
+    dyn = mb.dynamics(parallelogram((0.05,) * 3, 0.05), "lagrangian")
+    run = simulated(dyn, turned(dyn.model, -0.1), 3.0 * turned(dyn.model, 1.0), 0.25, "rk853", rtol=1e-12)
+    (told,) = run.stats.doubts
+
+    def up(x: float) -> float:
+        return float(9 - (9.81 * 1.25 * (np.sin(x) + np.sin(0.1)) + 0.2 * (x + 0.1)) / 0.25)
+
+    top = brentq(up, 0, 0.2)
+    rest, _ = quad(lambda s: 2 * s / np.sqrt(up(top - s * s)), 0, np.sqrt(top))
+    back, _ = quad(
+        lambda s: 2 * s / np.sqrt((9.81 * 1.25 * (np.sin(top) - np.sin(top - s * s)) - 0.2 * s * s) / 0.25),
+        *(0, np.sqrt(top)),
+    )
+    first, _ = quad(lambda x: up(x) ** -0.5, -0.1, 0)
+    times = [float(x) for x in re.search(r"t = (.*) \(s\)", told)[1].split(", ")]  # type: ignore[index]
+    assert times == pytest.approx([first, first + rest + back], rel=2e-3)
+
+
 @pytest.mark.parametrize(("count", "compiled"), [(1, True), (3, False)])
 def test_moreau_s_steps_tell_the_singular_pose_that_they_pass(count: int, compiled: bool) -> None:
     dyn = mb.dynamics(parallelogram((0.05,) * 3, 0.05), "lagrangian", compile=compiled)

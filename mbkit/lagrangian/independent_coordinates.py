@@ -78,7 +78,7 @@ class Chart(NamedTuple):
 
 
 class EmbeddedDynamics(Dynamics):
-    """The equation on one chart; time runs from `begin`, in s."""
+    """The equation on one chart."""
 
     engine = "embedded"
     _batches = False
@@ -90,20 +90,20 @@ class EmbeddedDynamics(Dynamics):
         "on independent coordinates there is the equation as a whole; the dynamics on all coordinates has the terms",
     )
 
-    def __init__(self, model: Model, whole: LagrangianDynamics, chart: Chart, begin: float) -> None:
+    def __init__(self, model: Model, whole: LagrangianDynamics, chart: Chart, t: float) -> None:
         super().__init__(model)
-        self._whole, self._chart, self._begin = whole, chart, begin
-        self._manifold = Manifold(whole).at(begin)
+        self._whole, self._chart = whole, chart
+        self._manifold = Manifold(whole).at(t)
         # Ends of Newton's last iterations: q, J, and the sign of the dependent block's determinant.
         self._places: deque[tuple[Array, Array, float]] = deque(maxlen=_MAX_STARTS)
 
     def at(self, /, **values: float) -> EmbeddedDynamics:
-        """Return the same dynamics at a time of the run."""
+        """Return the same dynamics at another time."""
         out = object.__new__(type(self))
         # Newton's iteration starts from where it last ended, at whatever time.
         out.__dict__.update(self.__dict__)
         (t,) = values.values()
-        out._manifold = Manifold(self._whole).at(self._begin + t)
+        out._manifold = Manifold(self._whole).at(t)
         return out
 
     def remember(self, q: Array) -> None:
@@ -276,7 +276,7 @@ class Embedded:
         return _smallest(block) / max(float(np.linalg.norm(J, 2)), sys.float_info.min)
 
     def on(self, chart: Chart, q: Array, t: float) -> EmbeddedDynamics:
-        """Return the dynamics on a chart's independent coordinates, from a consistent configuration on."""
+        """Return the dynamics on a chart's independent coordinates, at a time and a consistent configuration."""
         names = tuple(self.model.coordinate_names[i] for i in chart.independent)
         out = EmbeddedDynamics(ReducedModel(self.model, names), self.dynamics, chart, t)
         out.remember(q)

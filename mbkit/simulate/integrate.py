@@ -23,7 +23,7 @@ from mbkit.simulate import solvers
 from mbkit.simulate.checks import diagnostics, massless_joints
 from mbkit.simulate.constraint_projection import along_constraints, from_consistent
 from mbkit.simulate.events import as_events
-from mbkit.simulate.problem import RUNS, IntegrationProblem, RunRequest
+from mbkit.simulate.problem import RUNS, IntegrationProblem, RunRequest, Solver
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.run_data import Acting, RunData, RunSettings, SolverResult
 from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, Indices, check_room, save_times
@@ -43,12 +43,16 @@ _COST_IN_PYTHON: Final = 40
 _SIDE_BY_SIDE: Final = 8
 
 
+#: The run of a problem in parts, of which each is solved by the solver of its dynamics.
+InParts = Callable[[IntegrationProblem, Callable[[Dynamics], Solver]], SolverResult]
+
+
 def integrate(
-    dyn: Dynamics, request: RunRequest, solver: Callable[[IntegrationProblem], SolverResult] | None = None
+    dyn: Dynamics, request: RunRequest, in_parts: InParts | None = None
 ) -> tuple[RunData, FunctionError | None]:
     """Return a run's data, and the error of the torque or event function that ended it.
 
-    The solver is by default that of the method. Errors are those of `mbkit.simulate`.
+    Errors are those of `mbkit.simulate`.
     """
     chosen, model = method_of(request.method), dyn.model
     q, v = model.check_q(request.q0, "q0"), model.check_v(request.v0, "v0")
@@ -113,7 +117,7 @@ def integrate(
             # No step does.
             read.sample(0, start, q, v, None if batch is None else np.arange(batch))
         applied = read.applied(jumps)
-        outcome = _outcome(problem, chosen) if solver is None else along_constraints(dyn, solver(problem))
+        outcome = _outcome(problem, chosen, in_parts)
     seconds = time.perf_counter() - started
     settings = RunSettings(start, q.copy(), v.copy(), setting, outcome.doubts)
     doubts = outcome.doubts
@@ -184,7 +188,7 @@ def _acting(dyn: Dynamics, wrenches: RunWrenches | None, axes: str) -> Acting | 
     return (tuple(map(dyn.model.frame, wrenches)), axes) if wrenches else None
 
 
-def _outcome(problem: IntegrationProblem, method: Method) -> SolverResult:
+def _outcome(problem: IntegrationProblem, method: Method, in_parts: InParts | None) -> SolverResult:
     dyn, read = problem.dyn, problem.torque
     if "jump" in method.carries and "jump" not in dyn.model.effects:
         # Without jumps its step is that of this method.
@@ -208,24 +212,22 @@ def _outcome(problem: IntegrationProblem, method: Method) -> SolverResult:
     if "jump" in method.carries:
         return _solver(dyn, method, read)(problem)
 
-    def solver(smooth: Dynamics) -> Callable[[IntegrationProblem], SolverResult]:
+    def solver(smooth: Dynamics) -> Solver:
         return lambda part: along_constraints(smooth, _solver(smooth, method, read)(part))
 
-    if "jump" not in dyn.model.effects or dyn._soft_jumps:
-        return solver(dyn)(problem)
-    from mbkit.simulate.solvers.in_phases.runs import run_in_phases
-
-    return run_in_phases(problem, solver)
+    if "jump" in dyn.model.effects and not dyn._soft_jumps:
+        from mbkit.simulate.solvers.in_phases.runs import run_in_phases as in_parts
+    return solver(dyn)(problem) if in_parts is None else in_parts(problem, solver)
 
 
-def _solver(dyn: Dynamics, method: Method, torque: Torque) -> Callable[[IntegrationProblem], SolverResult]:
+def _solver(dyn: Dynamics, method: Method, torque: Torque) -> Solver:
     """Return the function that runs a method, imported when it is first needed."""
     module, function = method.solver.split(":")
     compiles = method.kind == "fixed" and method.compiled and method.formula
     as_data = not torque.callable or (torque.feedback is not None and method.explicit)
     if compiles and as_data and _compiles(dyn):
         module, function = "compiled_fixed_step", "run_rollout"
-    run: Callable[[IntegrationProblem], SolverResult] = solvers.load(module, function)
+    run: Solver = solvers.load(module, function)
     return run
 
 

@@ -23,6 +23,8 @@ from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.events import Event
 from mbkit.simulate.progress import Progress, ProgressFunction
+from mbkit.simulate.run_data import SolverResult
+from mbkit.simulate.singular_poses import SingularPoses
 from mbkit.simulate.time_grid import Grid, Indices, check_room, check_save
 from mbkit.simulate.torque import RunWrenches, Torque, TorqueFunction
 
@@ -76,6 +78,8 @@ class IntegrationProblem:
     # Equal steps, and the indices of the states to keep, of a method with a fixed step.
     equal_steps: Grid | None = None
     kept: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
+    # What looks for singular poses in the run of which this is a part.
+    passed: SingularPoses | None = None
 
     def __post_init__(self) -> None:
         numbers = self.q0.shape[-1] + self.v0.shape[-1]
@@ -159,3 +163,7 @@ class IntegrationProblem:
     def report(self, i: int) -> Callable[[float], None]:
         """Return a function that reports the time that the i-th state has reached."""
         return lambda t: self.bar.update((i + (t - self.start) / self.duration) / len(self.q))
+
+
+#: problem -> result.
+Solver = Callable[[IntegrationProblem], SolverResult]

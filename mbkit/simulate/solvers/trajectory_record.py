@@ -188,7 +188,7 @@ class TrajectoryRecord(RunRecord):
         self._model, self._space, self._save = dyn.model, space, problem.save
         self._watch = Watch(problem.events, member) if problem.events else None
         own = dyn if member is None or not dyn.model.constrained else dyn._of_samples([member])
-        self.passed = SingularPoses(own) if dyn._projects else None
+        self.passed = (problem.passed or SingularPoses(own)) if dyn._projects else None
         self.reached = problem.start
         self._q: Array | None = None
         self.ended: Ended = "finished"
@@ -236,11 +236,11 @@ class TrajectoryRecord(RunRecord):
             self.stop(diverged())
         return hit is None and not lost
 
-    def add(self, run: Stats, begin: float = 0.0) -> None:
-        """Add the cost of a part that was a run of its own and began at a time, s."""
+    def add(self, run: Stats) -> None:
+        """Add the cost of a part that was a run of its own."""
         self.count(run)
         assert isinstance(run.reached, float)
-        self.reached = begin + run.reached
+        self.reached = run.reached
 
     def keep(self, t: Array, q: Array, v: Array) -> None:
         """Keep states, (n,), (n, nq) and (n, nv), in mbkit's velocities."""
@@ -390,7 +390,8 @@ def assemble_result(
         reached[record.index] = float(record.reached)
         if record.ended != "finished":
             run.early[record.index] = record.ended, record.message
-    run.poses = {record.index: record.passed for record in records if record.passed}
+    # The whole run tells of the poses that its parts pass.
+    run.poses = {record.index: record.passed for record in records if record.passed and not problem.passed}
     states = [record.states for record in records]
     if batch is None:
         t, q, v = states[0][0], *(x[None] for x in states[0][1:])

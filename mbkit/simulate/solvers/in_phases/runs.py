@@ -1,6 +1,4 @@
-"""Runs in phases by an adaptive method: phase after phase, each ended where something stops or lets go.
-
-The end of a phase is an event. Methods with a fixed step are in `fixed`.
+"""Runs in phases by an adaptive method, phase after phase; those with a fixed step are in `fixed`.
 
 One step of an explicit method with forces that jump, of one state or a batch.
 """
@@ -8,145 +6,91 @@ One step of an explicit method with forces that jump, of one state or a batch.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any, Final
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from mbkit._check import EPS, Array
 from mbkit.engines import Dynamics
-from mbkit.errors import FunctionError, NumericalError
 from mbkit.methods.registry import Method
 from mbkit.simulate.events import Followed, Hit
-from mbkit.simulate.problem import RUNS, IntegrationProblem
+from mbkit.simulate.problem import IntegrationProblem, Solver
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.run_data import SolverResult
 from mbkit.simulate.solvers.fixed_step import run_fixed
-from mbkit.simulate.solvers.in_phases.fixed import MAX_EMPTY_PHASES, UNDECIDED, Solver, run_fixed_in_phases
+from mbkit.simulate.solvers.in_phases.fixed import UNDECIDED, run_fixed_in_phases
 from mbkit.simulate.solvers.in_phases.phases import Phase, Phases
-from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result, diverged
+from mbkit.simulate.solvers.stretches import Stretch, run_in_stretches
+from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result
 from mbkit.simulate.time_grid import Grid
 from mbkit.simulate.torque import Torque
-
-_END: Final = "end of a phase"
 
 
 def run_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics], Solver]) -> SolverResult:
     """Integrate a problem with forces that jump; `solver` gives that of smooth dynamics."""
-    dyn = problem.dyn
-    RUNS.admit(dyn.model)
     if problem.equal_steps is not None:
         return run_fixed_in_phases(problem, solver)
-    records = []
+    records: list[TrajectoryRecord] = []
     for i in range(len(problem.q)):
-        run = _Member(problem, i, solver)
-        records.append(run.record)
-        try:
-            _adaptive(run)
-        except FunctionError as error:
-            # A torque function failed while it was asked whether a phase ends.
-            run.record.fail(error)
-        except NumericalError as error:
-            run.record.stop(diverged(str(error)))
-        if run.record.error is not None:
-            break
+        if not (records and records[-1].error):
+            records.append(run_in_stretches(problem, i, _Friction(problem, i), solver))
     return assemble_result(problem, records)
 
 
-class _Member:
-    """One trajectory of a problem."""
+@dataclass(eq=False, kw_only=True)
+class _PhaseStretch(Stretch):
+    """One phase; what rests keeps its place and no velocity, to the bit."""
 
-    def __init__(self, problem: IntegrationProblem, i: int, solver: Callable[[Dynamics], Solver]) -> None:
-        self.problem, self.member, self._solver = problem, problem.member(i), solver
-        dyn = problem.dyn if self.member is None else problem.dyn._of_sample(i)
-        self.phases = Phases(dyn)
-        self.q, self.v = problem.q[i].copy(), problem.v[i].copy()
-        self.force = problem.torque.of_member(self.member)
-        # Parts look for the events, and for singular poses.
-        self.record = TrajectoryRecord(replace(problem, events=()), i)
-        self._stuck = 0
+    end = "end of a phase"
+    phase: Phase
+    phases: Phases
 
-    def begin(self, k: int, t: float, leaving: Array | None = None) -> Phase:
-        """Return the phase from here, with a torque that samples asked for its value."""
-        self.problem.sample(self.member or 0, k, t, np.concatenate([self.q, self.v]))
-        return self.phases.phase(t, self.q, self.v, self.force(k), leaving)
+    def states(self, t: Array, q: Array, v: Array) -> tuple[Array, Array]:  # noqa: ARG002
+        return self.phases.held(self.phase.still, self.q, q, v)
 
-    def solve(self, phase: Phase, k: int, **changes: object) -> SolverResult:
-        """Solve the rest of the problem from here, with the force from row k on."""
-        torque = self.problem.torque.of_part(self.member, k)
-        own = replace(self.problem, dyn=phase.dyn, q0=self.q, v0=self.v, torque=torque, **changes)  # type: ignore[arg-type]
-        result = self._solver(phase.dyn)(own)
-        q, v = self.phases.held(phase.still, self.q, result.q, result.v)
-        return replace(result, q=q, v=v)
 
-    def next(self, phase: Phase, k: int, t: float, q: Array, v: Array, *, moved: bool) -> Phase | None:
-        """Go to the end of a phase, and return the next one; None where it cannot be decided.
+class _Friction:
+    """Phases of the i-th trajectory of a problem, each up to where something stops or lets go."""
 
-        `moved` tells that time has passed.
-        """
-        q, v = self.phases.held(phase.still, self.q, q, v)
-        v, leaving = self.phases.after(phase, t, q, v, self.force(k))
-        self._stuck = 0 if moved else self._stuck + 1
-        if self._stuck > MAX_EMPTY_PHASES:
-            self.record.ended = "step_too_small"
-            self.record.message = f"{UNDECIDED} at t = {t:.9g} s: their phases end where they begin"
+    endless = f"{UNDECIDED} at t = {{t:.9g}} s: their phases end where they begin"
+
+    def __init__(self, problem: IntegrationProblem, i: int) -> None:
+        self._problem, self._member = problem, problem.member(i)
+        dyn = problem.dyn if self._member is None else problem.dyn._of_sample(i)
+        self._phases, self._force = Phases(dyn), problem.torque.of_member(self._member)
+        # Steps of what rests do not feel a force that changes with time.
+        self._timed = callable(self._force(0)) or dyn.model.time_parameter is not None
+
+    def first(self, t: float, q: Array, v: Array) -> Stretch:
+        return self._stretch(t, q, self._phases.stopped(self._phases.dyn, t, q, v, v == 0))
+
+    def following(self, last: Stretch, hit: Hit | None, t: float, q: Array, v: Array, *, moved: bool) -> Stretch | None:
+        assert isinstance(last, _PhaseStretch)
+        if hit is None or hit.name != last.end:
             return None
-        self.q, self.v = q, v
+        v, leaving = self._phases.after(last.phase, t, q, v, self._force(self._problem.interval(t)))
         # A joint that let go and came to rest at once did not let go.
-        out = self.begin(k, t, leaving if moved else None)
-        for _, name in self.phases.changes(phase, out):
-            self.record.events.append(Hit(name, t, self.q.copy(), self.v.copy(), self.member))
-        return out
+        out = self._stretch(t, q, v, leaving if moved else None)
+        changes = self._phases.changes(last.phase, out.phase)
+        return replace(out, begins=[Hit(name, t, q, v, self._member) for _, name in changes])
 
+    def _stretch(self, t: float, q: Array, v: Array, leaving: Array | None = None) -> _PhaseStretch:
+        phases, force, problem, k = self._phases, self._force, self._problem, self._problem.interval(t)
+        phase = phases.phase(t, q, v, force(k), leaving)
+        stops = np.array(problem.stops)
 
-def _adaptive(run: _Member) -> None:
-    problem, record = run.problem, run.record
-    t, k, rows = problem.start, 0, problem.save
-    stops = np.array(problem.stops)
-    # Steps of what rests do not feel a force that changes with time.
-    timed = callable(run.force(0)) or problem.dyn.model.time_parameter is not None
-    noise = max(1e-9, problem.tolerances.rtol)
-    if rows is None or (len(rows) and rows[0] == t):
-        record.keep(np.array([t]), run.q[None], run.v[None])
-    run.v = run.phases.stopped(run.phases.dyn, t, run.q, run.v, run.v == 0)
-    phase: Phase | None = run.begin(0, t) if problem.duration else None
-    while phase is not None and t < problem.end:
-        own, begun = phase, t
-
-        def end(s: float, q: Array, v: Array, own: Phase = own, begun: float = begun, k: int = k) -> float:
+        def margin(s: float, q: Array, v: Array) -> float:
             if not np.isfinite([*q, *v]).all():
                 # The solver tells that there is no state.
                 return 1.0
-            row = run.force(max(k, int(np.searchsorted(stops, s, side="left"))))
-            out = float(run.phases.margins(own, s, q, v, row).min())
-            return max(out, EPS) if s == begun else out
+            row = force(max(k, int(np.searchsorted(stops, s, side="left"))))
+            out = float(phases.margins(phase, s, q, v, row).min())
+            return max(out, EPS) if s == t else out
 
-        save = None if rows is None else np.append(rows[(rows > t) & (rows < problem.end)], problem.end)
-        events = (*problem.events, Followed(end, _END, parts=2 if timed and own.still.any() else 1, noise=noise))
-        result = run.solve(own, k, start=t, duration=problem.end - t, save=save, events=events)
-        phase_ended = bool(result.events) and result.events[-1].name == _END and result.ended == "event"
-        record.add(result)
-        record.last, record.doubts = result.last, [*record.doubts, *result.doubts]
-        record.events += [replace(x, member=run.member) for x in result.events if x.name != _END]
-        _keep(record, result, rows, t, at_end=not phase_ended)
-        if not phase_ended:
-            record.ended, record.message, record.error = result.ended, result.message, result.error
-            break
-        hit = result.events[-1]
-        moved = hit.t - t > 1e-12 * max(abs(t), problem.duration)
-        t, k = hit.t, int(np.searchsorted(stops, hit.t, side="right"))
-        phase = run.next(own, min(k, len(stops) - 1), t, hit.q, hit.v, moved=moved)
-        if rows is None and moved:
-            record.keep(np.array([t]), run.q[None], run.v[None])
-
-
-def _keep(record: TrajectoryRecord, result: SolverResult, rows: Array | None, begun: float, *, at_end: bool) -> None:
-    which = result.t > begun
-    if not at_end and len(result.t):
-        which[-1] = rows is not None and bool(np.isin(result.t[-1], rows))
-    elif rows is not None and result.ended == "finished":
-        which &= np.isin(result.t, rows)
-    record.keep(result.t[which], result.q[which], result.v[which])
+        parts = 2 if self._timed and phase.still.any() else 1
+        end = Followed(margin, _PhaseStretch.end, parts=parts, noise=max(1e-9, problem.tolerances.rtol))
+        return _PhaseStretch(dyn=phase.dyn, q=q, v=v, ends=[end], phase=phase, phases=phases)
 
 
 def step(dyn: Dynamics, method: Method, q: Array, v: Array, tau: Array, dt: float) -> tuple[Array, Array]:
