@@ -8,8 +8,8 @@ with a tolerance goes through it on all coordinates, with multipliers.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import replace
+from typing import Any, Final
 
 import numpy as np
 
@@ -17,8 +17,8 @@ from mbkit._check import Array, finite_array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
 from mbkit.errors import FunctionError, MbkitWarning, NumericalError, UnsupportedError, warn
-from mbkit.lagrangian.independent_coordinates import SINGULAR_VALUE_RATIO, Chart, Embedded, EmbeddedDynamics
-from mbkit.methods.registry import METHODS, Method, method_of
+from mbkit.lagrangian.independent_coordinates import SINGULAR_VALUE_RATIO, Chart, Embedded
+from mbkit.methods.registry import METHODS, method_of
 from mbkit.model.integration_space import Space
 from mbkit.simulate.constraint_projection import along_constraints
 from mbkit.simulate.events import Event, Hit
@@ -35,15 +35,11 @@ from mbkit.simulate.torque import Force, Torque
 
 _WORN: Final = "the dependent coordinates are badly chosen"
 _NEAR: Final = "near a singular pose"
+_ENDLESS: Final = "stopped at t = {t:.9g} s, where no independent coordinates serve: charts end where they begin"
 #: Distance behind a singular pose from which charts serve again, in distances at which they end.
 _DISTANCE_BEHIND_POSE: Final = 20
 #: Smallest measure of a chart; its logarithm must be finite.
 _MIN_MEASURE: Final = 1e-16
-
-
-def _on_charts(method: Method) -> bool:
-    """Return whether a method needs accelerations alone: charts have no derivatives and no expressions."""
-    return not method.engines and not method.jacobian
 
 
 def integrate_on_charts(system: Embedded, request: RunRequest) -> tuple[RunData, FunctionError | None]:
@@ -53,11 +49,12 @@ def integrate_on_charts(system: Embedded, request: RunRequest) -> tuple[RunData,
         raise UnsupportedError(
             "wrenches: a system written as energies has no frames; give the generalized force, torque="
         )
-    if not _on_charts(method):
-        usable = ", ".join(m.name for m in METHODS.values() if _on_charts(m))
+    # Charts have no derivatives and no expressions.
+    usable = [m.name for m in METHODS.values() if not m.engines and not m.jacobian]
+    if method.name not in usable:
         raise UnsupportedError(
             f"{method.name}: not on independent coordinates, which Newton's iteration leads to; "
-            f"use {usable}, or the form with multipliers, lag.dynamics()"
+            f"use {', '.join(usable)}, or the form with multipliers, lag.dynamics()"
         )
     finite_array("q0", request.q0, (model.nq,))
     finite_array("v0", request.v0, (model.nv,))
@@ -67,7 +64,8 @@ def integrate_on_charts(system: Embedded, request: RunRequest) -> tuple[RunData,
 def _run(system: Embedded, problem: IntegrationProblem, solver: Callable[[Dynamics], Solver]) -> SolverResult:
     charts = _Charts(system)
     if problem.equal_steps is None:
-        record = run_in_stretches(replace(problem, passed=charts.passed), 0, charts, solver)
+        looked = replace(problem, passed=charts.passed)
+        record = run_in_stretches(looked, 0, charts.stretch, solver, _ENDLESS)
         if record.ended == "event" and record.events[-1].name == _NEAR:
             record.ended, record.message = charts.undetermined(record.reached)
         result = assemble_result(problem, [record])
@@ -88,38 +86,35 @@ def _run(system: Embedded, problem: IntegrationProblem, solver: Callable[[Dynami
     return along_constraints(system.dynamics, result)
 
 
-@dataclass(eq=False, kw_only=True)
-class _OnChart(Stretch):
-    """A part of a run on a chart.
+class _OnChart:
+    """A part of a run on a chart, from a state on all coordinates on.
 
     Dependent coordinates are searched from those kept nearest in time, since a place far off may lie on another branch.
     """
 
-    end = _WORN
-    dyn: EmbeddedDynamics
-    system: Embedded
-    chart: Chart
-    #: Times of steps' ends and near them, and configurations there; and what looks for singular poses at these.
-    places: list[tuple[float, Array]]
-    passed: SingularPoses
+    def __init__(self, system: Embedded, passed: SingularPoses, t: float, q: Array, v: Array) -> None:
+        self.system, self.chart, self._passed = system, system.chart(q, t), passed
+        self.dyn = system.on(self.chart, q, t)
+        self.begin = Hit(f"independent: {system.names(self.chart)}", t, q.copy(), v.copy())
+        #: Times of steps' ends and near them, and configurations there.
+        self._places = [(t, q)]
 
-    def start(self) -> tuple[Array, Array]:
-        return self.q[self.chart.independent], self.v[self.chart.independent]
+    def start(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return a state on the chart."""
+        return q[self.chart.independent], v[self.chart.independent]
 
-    def states(self, t: Array, q: Array, v: Array) -> tuple[Array, Array]:
-        out = np.empty((len(t), len(self.q))), np.empty((len(t), len(self.v)))
-        for k, (s, u, w) in enumerate(zip(t.tolist(), q, v, strict=True)):
-            near, place = min(self.places, key=lambda x: abs(x[0] - s))
+    def states(self, t: Array, u: Array, w: Array) -> tuple[Array, Array]:
+        """Return states at some times on all coordinates."""
+        out = tuple(np.empty((len(t), self.system.model.nv)) for _ in "qv")
+        for k, s in enumerate(t.tolist()):
+            near, place = min(self._places, key=lambda x: abs(x[0] - s))
             at_time(self.dyn, near).remember(place)
-            out[0][k], out[1][k] = self.state(s, u, w)
-        return out
+            out[0][k], out[1][k] = self.state(s, u[k], w[k])
+        return out[0], out[1]
 
     def state(self, t: float, u: Array, w: Array) -> tuple[Array, Array]:
         """Return q and v on all coordinates, searched from where a search last ended."""
         return at_time(self.dyn, t).state(u, w)
-
-    def torque(self, torque: Torque) -> Torque:
-        return _PulledBack(torque, self)
 
     def pulled(self, force: Force) -> Force:
         """Return a force on the coordinates of the chart."""
@@ -154,10 +149,10 @@ class _OnChart(Stretch):
 
     def _place(self, t: float, u: Array) -> Array:
         """Return the configuration at or near a step's end, and keep it."""
-        if self.places[-1][0] != t:
-            self.places.append((t, at_time(self.dyn, t).configuration(u)))
-            self.passed.saw(*self.places[-1])
-        return self.places[-1][1]
+        if self._places[-1][0] != t:
+            self._places.append((t, at_time(self.dyn, t).configuration(u)))
+            self._passed.saw(*self._places[-1])
+        return self._places[-1][1]
 
 
 class _PulledBack(Torque):
@@ -177,41 +172,32 @@ class _PulledBack(Torque):
 class _Charts:
     """The charts of a system; near singular poses stretches on all coordinates stand between them."""
 
-    endless = "stopped at t = {t:.9g} s, where no independent coordinates serve: charts end where they begin"
-
     def __init__(self, system: Embedded) -> None:
-        self.system, self.stays = system, system.independent is not None
+        self.system, self.stays, self.passed = system, system.independent is not None, SingularPoses(system.dynamics)
         #: The run goes through singular poses: the choice is open, and nothing is moved in time.
         self._passes = not self.stays and system.model.time_parameter is None
         #: Configurations near singular poses with which stretches begin, by their times.
         self.near: dict[float, Array] = {}
-        self.passed = SingularPoses(system.dynamics)
 
-    def first(self, t: float, q: Array, v: Array) -> Stretch:
-        return self._stretch(t, q, v, across=False)
-
-    def following(self, last: Stretch, hit: Hit | None, t: float, q: Array, v: Array, *, moved: bool) -> Stretch | None:  # noqa: ARG002
-        across = hit is not None and hit.name == _NEAR
-        if hit is None or hit.name == _WORN or (across and self._passes):
-            return self._stretch(t, q, v, across=across)
-        return None
-
-    def _stretch(self, t: float, q: Array, v: Array, *, across: bool) -> Stretch:
-        out = self.on_chart(t, q, v)
-        near = self.system.nearness(out.chart, q, t)
+    def stretch(self, t: float, q: Array, v: Array, *, across: bool = False) -> Stretch:
+        """Return the stretch from a state on: on the best chart, or on all coordinates `across` a singular pose."""
+        on = _OnChart(self.system, self.passed, t, q, v)
+        near = self.system.nearness(on.chart, q, t)
         if near < SINGULAR_VALUE_RATIO:
             self.near[t] = q
-        if not (across or (near < SINGULAR_VALUE_RATIO and self._passes)):
-            return out
-        # Steps end behind the pose, where their errors are not those of a state within a step.
-        return Stretch(dyn=self.system.dynamics, q=q, v=v, until=t + self._behind(out.chart, q, v, t))
+        if across or (near < SINGULAR_VALUE_RATIO and self._passes):
+            # Steps end behind the pose, where their errors are not those of a state within a step.
+            until = t + self._behind(on.chart, q, v, t)
+            return Stretch(dyn=self.system.dynamics, q=q, v=v, until=until, follow=self._follow)
+        own: dict[str, Any] = {name: getattr(on, name) for name in ("dyn", "start", "states", "events")}
+        own |= {"torque": lambda torque: _PulledBack(torque, on), "begins": [on.begin], "end": _WORN}
+        return Stretch(q=q, v=v, follow=self._follow, **own)
 
-    def on_chart(self, t: float, q: Array, v: Array) -> _OnChart:
-        """Return the stretch on the best chart."""
-        system, chart = self.system, self.system.chart(q, t)
-        begin = Hit(f"independent: {system.names(chart)}", t, q.copy(), v.copy())
-        known = {"system": system, "chart": chart, "places": [(t, q)], "passed": self.passed}
-        return _OnChart(dyn=system.on(chart, q, t), q=q, v=v, begins=[begin], **known)
+    def _follow(self, hit: Hit | None, t: float, q: Array, v: Array, _moved: bool) -> Stretch | None:
+        across = hit is not None and hit.name == _NEAR
+        if hit is None or hit.name == _WORN or (across and self._passes):
+            return self.stretch(t, q, v, across=across)
+        return None
 
     def undetermined(self, t: float) -> tuple[Ended, str]:
         """Return the end at a singular pose of a choice that stays."""
@@ -246,15 +232,14 @@ class _ChartStepper(Stepper):
             except DivergenceError:
                 if self._charts.stays:
                     raise
-        self._on = self._charts.on_chart(t, q, v)
-        self._record.events += self._on.begins
+        self._on = _OnChart(self._charts.system, self._charts.passed, t, q, v)
+        self._record.events.append(self._on.begin)
         space = Space(self._on.dyn.model)
         self._step = make_step(self._method, Field(self._on.dyn, space), space)
         return self._stepped(self._on, t, h, q, v, force)
 
     def _stepped(self, on: _OnChart, t: float, h: float, q: Array, v: Array, force: Force) -> tuple[Array, Array]:
-        which = on.chart.independent
-        u, w = self._step(t, h, q[which], v[which], on.pulled(force))
+        u, w = self._step(t, h, *on.start(q, v), on.pulled(force))
         try:
             return on.state(t + h, u, w)
         except NumericalError as error:
@@ -268,8 +253,7 @@ class _ChartStepper(Stepper):
         self._near = system.nearness(chart, q, t) < SINGULAR_VALUE_RATIO
         if self._near and not before:
             self._record.events.append(Hit(_NEAR, t, q, w))
-            self.over = charts.stays
-            if self.over:
+            if charts.stays:
                 self._record.early[0] = charts.undetermined(t)
         if not charts.stays and system.quality(chart, q, t) < system.least:
             self._on = None

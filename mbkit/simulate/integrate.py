@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Final, Protocol, runtime_checkable
+from typing import Final
 
 import numpy as np
 
@@ -64,18 +64,16 @@ def integrate(
     start, duration, dt = times_of(dyn, chosen, request.t0, request.duration, request.dt)
     _require_engine(dyn, chosen)
     q, v = from_consistent(dyn, q, v, start)
-    wanted = as_events(request.events)
-    if wanted and not chosen.events:
-        _refuse("events", chosen, [m.name for m in METHODS.values() if m.events])
-    acting = _acting(dyn, request.wrenches, request.wrench_axes)
-    if acting and not chosen.wrenches:
-        _refuse("wrenches on frames", chosen, [m.name for m in METHODS.values() if m.wrenches])
+    wanted, acting = as_events(request.events), _acting(dyn, request.wrenches, request.wrench_axes)
     span = start, start + duration, 0.0 if chosen.kind == "adaptive" else dt
     hold = _period(request, *span, (1 if batch is None else batch) * model.nv)
     at_stages = None if hold else request.torque
-    given = [at_stages, *(request.wrenches or {}).values()]
-    if any(map(callable, given)) and not chosen.callables:
-        _refuse("torque functions", chosen, [m.name for m in METHODS.values() if m.callables])
+    functions = any(map(callable, [at_stages, *(request.wrenches or {}).values()]))
+    asked = ("events", wanted, "events"), ("wrenches on frames", acting, "wrenches")
+    for what, given, name in (*asked, ("torque functions", functions, "callables")):
+        if given and not getattr(chosen, name):
+            others = ", ".join(m.name for m in METHODS.values() if getattr(m, name))
+            raise UnsupportedError(f"{chosen.name}: {what} are not there with this method; use {others}")
     _warn_beyond_limits(model, q)
     if model.jumping_forces:
         warn(
@@ -233,21 +231,7 @@ def _solver(dyn: Dynamics, method: Method, torque: Torque) -> Solver:
 
 def _compiles(dyn: Dynamics) -> bool:
     """Return whether whole steps can be compiled: own derivation, written out, and a compiler."""
-    if not dyn._derived:
-        return False
-    # Other engines need no CasADi.
-    from mbkit.engines.lagrangian import LagrangianDynamics
-
-    return isinstance(dyn, LagrangianDynamics) and dyn._compiles_steps
-
-
-@runtime_checkable
-class TakesParameters(Protocol):
-    """An engine whose parameters may have a value for each sample."""
-
-    @property
-    def _parameter_values(self) -> Array:
-        """Values of the model's parameters, (p,) or one row per sample."""
+    return bool(getattr(dyn, "_compiles_steps", False))
 
 
 def times_of(
@@ -292,10 +276,8 @@ def _held_time(dyn: Dynamics) -> float:
     clock = dyn.model.time_parameter
     if clock is None:
         return 0.0
-    if isinstance(dyn, TakesParameters):
-        held = np.unique(np.atleast_2d(dyn._parameter_values)[:, list(dyn.model.parameters).index(clock)])
-    else:
-        held = np.array([dyn.model.parameters[clock]])
+    values = getattr(dyn, "_parameter_values", np.array([*dyn.model.parameters.values()]))
+    held = np.unique(np.atleast_2d(values)[:, list(dyn.model.parameters).index(clock)])
     if len(held) != 1:
         raise InputError(f"t0: the samples hold {len(held)} different values of {clock}; give one start time, t0=")
     return float(held[0])
@@ -309,10 +291,6 @@ def _require_engine(dyn: Dynamics, method: Method) -> None:
             f"{method.name}: not on the {dyn.engine} engine{why}; use {has}, or a method that any engine has: "
             + ", ".join(m.name for m in METHODS.values() if not m.engines)
         )
-
-
-def _refuse(what: str, method: Method, others: Sequence[str]) -> None:
-    raise UnsupportedError(f"{method.name}: {what} are not there with this method; use {', '.join(others)}")
 
 
 def _batch(dyn: Dynamics, states: int | None) -> int | None:

@@ -25,7 +25,7 @@ from mbkit.simulate.events import Event
 from mbkit.simulate.progress import Progress, ProgressFunction
 from mbkit.simulate.run_data import SolverResult
 from mbkit.simulate.singular_poses import SingularPoses
-from mbkit.simulate.time_grid import Grid, Indices, check_room, check_save
+from mbkit.simulate.time_grid import Grid, Indices, check_room
 from mbkit.simulate.torque import RunWrenches, Torque, TorqueFunction
 
 
@@ -82,11 +82,13 @@ class IntegrationProblem:
     passed: SingularPoses | None = None
 
     def __post_init__(self) -> None:
-        numbers = self.q0.shape[-1] + self.v0.shape[-1]
-        if self.equal_steps is None:
-            check_save(self.save, self.batch, numbers)
-        else:
-            check_room(len(self.kept) * len(self.q), numbers)
+        kept = self.save if self.equal_steps is None else self.kept
+        if kept is not None:
+            check_room(len(kept) * len(self.q), self.q0.shape[-1] + self.v0.shape[-1])
+        elif self.batch is not None:
+            raise InputError(
+                "save: expected a grid of times for a batch with an adaptive method; without it each state has its own"
+            )
 
     @classmethod
     def on_grid(

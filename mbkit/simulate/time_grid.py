@@ -131,13 +131,3 @@ def check_room(
             f"{what} {rows:.16g} rows of {numbers} numbers, which would take {rows * numbers * 8 / 2**30:.3g} GiB; "
             f"{instead}"
         )
-
-
-def check_save(save: Array | None, batch: int | None, numbers: int) -> None:
-    """Refuse a batch without common times, and more states than a machine holds."""
-    if batch is not None and save is None:
-        raise InputError(
-            "save: expected a grid of times for a batch with an adaptive method; without it each state has its own"
-        )
-    if save is not None:
-        check_room(len(save) * (1 if batch is None else batch), numbers)

@@ -43,9 +43,6 @@ def to_body_velocity(space: Space, q: Array, w: Array) -> Array:
 class Stepper:
     """Steps of one state or a batch, one at a time; w is the velocity or momentum that the method carries along."""
 
-    #: Whether no step follows the last one.
-    over = False
-
     def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
         """Return q and w at t + h; NaN where there are none, or `DivergenceError`."""
         raise NotImplementedError
@@ -202,7 +199,7 @@ class SteppedRun:
         if self._row < len(record.kept) and k + 1 == record.kept[self._row]:
             record.q[which, self._row], record.v[which, self._row] = self._q, step.to_body_velocity(self._q, self._w)
             self._row += 1
-        return not step.over
+        return not record.early
 
     def _one_by_one(self, t: float, h: float, k: int, why: str) -> tuple[Array, Array, NDArray[np.bool_], str]:
         # One divergence must not stop the others of a batch: each steps by itself.

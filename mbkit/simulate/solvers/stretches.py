@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Final, Protocol
+from typing import Final
 
 import numpy as np
 
@@ -29,72 +29,58 @@ _MAX_EMPTY: Final = 20
 _NO_TIME: Final = 1e-12
 
 
-@dataclass(eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Stretch:
-    """Smooth dynamics from a state on, on coordinates of their own: here those of the run.
+    """Smooth dynamics from a state on, on coordinates of their own or those of the run.
 
     Attributes
     ----------
     q, v : array
         The state, on the coordinates of the run.
+    follow : callable
+        (hit, t, q, v, moved) -> what follows at its end, by one of the events `ends`, another event, or by `until`,
+        where hit is None; None where an event ends the run. `moved` tells that time has passed.
     until : float
-        Where it ends if no event ends it, s.
+        s.
     begins : sequence of Hit
         Events of the run with which it begins.
-    ends : sequence of Event
-        Events, beside those of the run, that may end it.
+    end : str
+        Name of the event that ends it and is none of the run.
+    start, states, torque, events : callable
+        The state on its own coordinates; states of these at times, (n, ·), on those of the run; and the run's force
+        and its events on its own coordinates.
     """
 
     dyn: Dynamics
     q: Array
     v: Array
+    follow: Callable[[Hit | None, float, Array, Array, bool], Stretch | None]
     until: float = math.inf
     begins: Sequence[Hit] = ()
     ends: Sequence[Event] = ()
-    #: Name of the event at its end that is none of the run.
-    end: ClassVar[str] = ""
-
-    def start(self) -> tuple[Array, Array]:
-        """Return the state on its own coordinates."""
-        return self.q, self.v
-
-    def states(self, t: Array, q: Array, v: Array) -> tuple[Array, Array]:  # noqa: ARG002
-        """Return its states, (n, ·), on the coordinates of the run."""
-        return q, v
-
-    def torque(self, torque: Torque) -> Torque:
-        """Return the run's force on its own coordinates."""
-        return torque
-
-    def events(self, events: Sequence[Event]) -> Sequence[Event]:
-        """Return the run's events on its own coordinates."""
-        return events
-
-
-class Breaks(Protocol):
-    """A kind of stretches: with which one a run begins, and what follows at the end of each."""
-
-    #: Message of a run whose stretches end where they begin; {t} is when, s.
-    endless: str
-
-    def first(self, t: float, q: Array, v: Array) -> Stretch:
-        """Return the stretch with which a run begins."""
-
-    def following(self, last: Stretch, hit: Hit | None, t: float, q: Array, v: Array, *, moved: bool) -> Stretch | None:
-        """Return what follows a stretch that an event ended, or its time; None where the event ends the run.
-
-        `moved` tells that time has passed in it.
-        """
+    end: str = ""
+    start: Callable[[Array, Array], tuple[Array, Array]] = lambda q, v: (q, v)
+    states: Callable[[Array, Array, Array], tuple[Array, Array]] = lambda _, q, v: (q, v)
+    torque: Callable[[Torque], Torque] = lambda torque: torque
+    events: Callable[[Sequence[Event]], Sequence[Event]] = lambda events: events
 
 
 def run_in_stretches(
-    problem: IntegrationProblem, i: int, breaks: Breaks, solver: Callable[[Dynamics], Solver]
+    problem: IntegrationProblem,
+    i: int,
+    first: Callable[[float, Array, Array], Stretch],
+    solver: Callable[[Dynamics], Solver],
+    endless: str,
 ) -> TrajectoryRecord:
-    """Integrate the i-th state; `solver` gives that of smooth dynamics."""
+    """Integrate the i-th state; `solver` gives that of smooth dynamics.
+
+    `endless` is the message of a run whose stretches end where they begin, with the time as {t}.
+    """
     # Stretches look for the events.
     record = TrajectoryRecord(replace(problem, events=()), i)
     try:
-        _to_end(problem, record, breaks, solver)
+        if not _to_end(problem, record, first, solver):
+            record.ended, record.message = "step_too_small", endless.format(t=record.reached)
     except FunctionError as error:
         # A torque function failed while it was asked what follows.
         record.fail(error)
@@ -104,19 +90,21 @@ def run_in_stretches(
 
 
 def _to_end(
-    problem: IntegrationProblem, record: TrajectoryRecord, breaks: Breaks, solver: Callable[[Dynamics], Solver]
-) -> None:
+    problem: IntegrationProblem,
+    record: TrajectoryRecord,
+    first: Callable[[float, Array, Array], Stretch],
+    solver: Callable[[Dynamics], Solver],
+) -> bool:
+    """Go over the run; return whether its stretches have an end."""
     i, rows, t, empty = record.index, problem.save, problem.start, 0
     q, v = problem.q[i], problem.v[i]
     record.begin(q, v)
-    if not problem.duration:
-        return
     problem.sample(i, 0, t, np.concatenate([q, v]))
-    stretch: Stretch | None = breaks.first(t, q, v)
+    stretch = first(t, q, v) if problem.duration else None
     while stretch is not None:
         record.events += stretch.begins
-        if t >= problem.end:
-            return
+        if t >= problem.end or record.crawls():
+            break
         begun, t = t, min(stretch.until, problem.end)
         result = _solved(problem, record, stretch, begun, t, solver)
         record.add(result)
@@ -131,27 +119,23 @@ def _to_end(
         record.keep(result.t[inner], q[inner], v[inner])
         if not result.finished:
             record.ended, record.message, record.error = result.ended, result.message, result.error
-            return
+            break
         t, q, v = (t, q[-1], v[-1]) if last is None else (last.t, last.q, last.v)
         record.reached = t
         problem.report(i)(t)
         moved = t - begun > _NO_TIME * max(abs(begun), problem.duration)
-        stretch, before = None, stretch
+        empty, follow, stretch = 0 if moved else empty + 1, stretch.follow, None
+        if empty > _MAX_EMPTY:
+            return False
         if last is not None or t < problem.end:
-            empty = 0 if moved else empty + 1
-            if empty > _MAX_EMPTY:
-                record.ended, record.message = "step_too_small", breaks.endless.format(t=t)
-                return
             problem.sample(i, problem.interval(t), t, np.concatenate([q, v]))
-            stretch = breaks.following(before, last, t, q, v, moved=moved)
+            stretch = follow(last, t, q, v, moved)
         if last is not None and stretch is None:
             record.stop_at(last)
-            return
-        if moved if rows is None else bool((rows[rows > begun] == t).any()):
+        elif moved if rows is None else bool((rows[rows > begun] == t).any()):
             q, v = (q, v) if stretch is None else (stretch.q, stretch.v)
             record.keep(np.array([t]), q[None], v[None])
-        if stretch is not None and record.crawls():
-            return
+    return True
 
 
 def _solved(
@@ -163,7 +147,7 @@ def _solved(
     solver: Callable[[Dynamics], Solver],
 ) -> SolverResult:
     """Return the run of one stretch."""
-    i, rows, span, (q, v) = record.index, problem.save, until - t, stretch.start()
+    i, rows, span, (q, v) = record.index, problem.save, until - t, stretch.start(stretch.q, stretch.v)
     torque, report = problem.torque.of_part(problem.member(i), problem.interval(t)), problem.report(i)
     own = replace(
         problem,

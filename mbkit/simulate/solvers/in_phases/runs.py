@@ -5,9 +5,9 @@ One step of an explicit method with forces that jump, of one state or a batch.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, Final
 
 import numpy as np
 
@@ -26,6 +26,8 @@ from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_
 from mbkit.simulate.time_grid import Grid
 from mbkit.simulate.torque import Torque
 
+_END: Final = "end of a phase"
+
 
 def run_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics], Solver]) -> SolverResult:
     """Integrate a problem with forces that jump; `solver` gives that of smooth dynamics."""
@@ -34,26 +36,14 @@ def run_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics], Solv
     records: list[TrajectoryRecord] = []
     for i in range(len(problem.q)):
         if not (records and records[-1].error):
-            records.append(run_in_stretches(problem, i, _Friction(problem, i), solver))
+            first = _Friction(problem, i).first
+            endless = f"{UNDECIDED} at t = {{t:.9g}} s: their phases end where they begin"
+            records.append(run_in_stretches(problem, i, first, solver, endless))
     return assemble_result(problem, records)
-
-
-@dataclass(eq=False, kw_only=True)
-class _PhaseStretch(Stretch):
-    """One phase; what rests keeps its place and no velocity, to the bit."""
-
-    end = "end of a phase"
-    phase: Phase
-    phases: Phases
-
-    def states(self, t: Array, q: Array, v: Array) -> tuple[Array, Array]:  # noqa: ARG002
-        return self.phases.held(self.phase.still, self.q, q, v)
 
 
 class _Friction:
     """Phases of the i-th trajectory of a problem, each up to where something stops or lets go."""
-
-    endless = f"{UNDECIDED} at t = {{t:.9g}} s: their phases end where they begin"
 
     def __init__(self, problem: IntegrationProblem, i: int) -> None:
         self._problem, self._member = problem, problem.member(i)
@@ -63,34 +53,37 @@ class _Friction:
         self._timed = callable(self._force(0)) or dyn.model.time_parameter is not None
 
     def first(self, t: float, q: Array, v: Array) -> Stretch:
-        return self._stretch(t, q, self._phases.stopped(self._phases.dyn, t, q, v, v == 0))
+        """Return the phase with which the run begins."""
+        v = self._phases.stopped(self._phases.dyn, t, q, v, v == 0)
+        return self._stretch(self._phases.phase(t, q, v, self._force(0)), t, q, v)
 
-    def following(self, last: Stretch, hit: Hit | None, t: float, q: Array, v: Array, *, moved: bool) -> Stretch | None:
-        assert isinstance(last, _PhaseStretch)
-        if hit is None or hit.name != last.end:
+    def _follow(self, phase: Phase, hit: Hit | None, t: float, q: Array, v: Array, moved: bool) -> Stretch | None:
+        if hit is None or hit.name != _END:
             return None
-        v, leaving = self._phases.after(last.phase, t, q, v, self._force(self._problem.interval(t)))
+        phases, force = self._phases, self._force(self._problem.interval(t))
+        v, leaving = phases.after(phase, t, q, v, force)
         # A joint that let go and came to rest at once did not let go.
-        out = self._stretch(t, q, v, leaving if moved else None)
-        changes = self._phases.changes(last.phase, out.phase)
-        return replace(out, begins=[Hit(name, t, q, v, self._member) for _, name in changes])
+        new = phases.phase(t, q, v, force, leaving if moved else None)
+        changes = [Hit(name, t, q, v, self._member) for _, name in phases.changes(phase, new)]
+        return self._stretch(new, t, q, v, changes)
 
-    def _stretch(self, t: float, q: Array, v: Array, leaving: Array | None = None) -> _PhaseStretch:
-        phases, force, problem, k = self._phases, self._force, self._problem, self._problem.interval(t)
-        phase = phases.phase(t, q, v, force(k), leaving)
-        stops = np.array(problem.stops)
+    def _stretch(self, phase: Phase, begun: float, q: Array, v: Array, begins: Sequence[Hit] = ()) -> Stretch:
+        phases, force, k = self._phases, self._force, self._problem.interval(begun)
+        stops = np.array(self._problem.stops)
 
-        def margin(s: float, q: Array, v: Array) -> float:
+        def margin(t: float, q: Array, v: Array) -> float:
             if not np.isfinite([*q, *v]).all():
                 # The solver tells that there is no state.
                 return 1.0
-            row = force(max(k, int(np.searchsorted(stops, s, side="left"))))
-            out = float(phases.margins(phase, s, q, v, row).min())
-            return max(out, EPS) if s == t else out
+            row = force(max(k, int(np.searchsorted(stops, t, side="left"))))
+            out = float(phases.margins(phase, t, q, v, row).min())
+            return max(out, EPS) if t == begun else out
 
         parts = 2 if self._timed and phase.still.any() else 1
-        end = Followed(margin, _PhaseStretch.end, parts=parts, noise=max(1e-9, problem.tolerances.rtol))
-        return _PhaseStretch(dyn=phase.dyn, q=q, v=v, ends=[end], phase=phase, phases=phases)
+        end = Followed(margin, _END, parts=parts, noise=max(1e-9, self._problem.tolerances.rtol))
+        held = partial(phases.held, phase.still, q)
+        more: dict[str, Any] = {"states": lambda _, q, v: held(q, v), "follow": partial(self._follow, phase)}
+        return Stretch(dyn=phase.dyn, q=q, v=v, begins=begins, ends=[end], end=_END, **more)
 
 
 def step(dyn: Dynamics, method: Method, q: Array, v: Array, tau: Array, dt: float) -> tuple[Array, Array]:
