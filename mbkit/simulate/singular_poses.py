@@ -214,8 +214,8 @@ class SingularPoses:
             self.take(*end)
 
     def take(self, t: float, dependence: float, q: Array) -> None:
-        """Take in the end of a step by the `dependence` of rows there; one that is not finite says nothing."""
-        if dependence == dependence and all(t > before for before, *_ in self._seen[-1:]):
+        """Take in the end of a step by the `dependence` of rows there; one that is not positive says nothing."""
+        if dependence > 0 and all(t > before for before, *_ in self._seen[-1:]):
             self._seen = [*self._seen[1 - _WINDOW :], (t, dependence**-0.5, q)]
             # The step before is known to both sides.
             self._decide(len(self._seen) - 2)
