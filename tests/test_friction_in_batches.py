@@ -13,6 +13,7 @@ import mbkit as mb
 from mbkit._check import EPS
 from mbkit.errors import InputError, MbkitWarning, ModelError
 from mbkit.model import Model
+from mbkit.simulate.solvers.in_phases import fixed
 from mbkit.simulate.solvers.in_phases.fixed import first_zero
 from tests.random_trees import off
 from tests.test_dry_friction import mostly_at_rest, rubbed
@@ -298,3 +299,19 @@ def test_what_stands_for_ever_is_that_of_steps_that_hold_it(engine: str) -> None
     assert held.stats.evaluations == 0 < stepped.stats.evaluations
     loose = mb.simulate(dyn, q, v, DURATION, dt=STEP, torque=50 * push)
     assert abs(loose.v[:, 1]).min() > 0
+
+
+def test_few_blocks_are_set_up_and_few_steps_behind_ends_are_in_vain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blocks become as long as changes are rare: half swings of 0.63 s come to rest after 1 to 12 of them."""
+    b = mb.ModelBuilder("swings", gravity=(0, 0, 0))
+    b.add_body("m", mass=2.0)
+    b.add_joint("x", "prismatic", parent="world", child="m", axis=(1, 0, 0), friction=1.0, stiffness=50.0)
+    count, steps, blocks, one = 200, 3000, list[int](), fixed._Members._block
+    monkeypatch.setattr(fixed._Members, "_block", lambda run: blocks.append(1) or one(run))
+    q = np.linspace(0.1, 1.0, count)[:, None]
+    run = mb.simulate(mb.dynamics(b.build(), "lagrangian", compile=True), q, 0 * q, 6.0, "rk4", dt=6.0 / steps)
+    # Each half swing is 2 f / k shorter.
+    swings = [int(np.ceil(x / 0.04 - 0.5)) for x in q[:, 0]]
+    assert len(run.events) == sum(min(n, 9) for n in swings)
+    assert len(blocks) <= 24
+    assert run.stats.steps < 1.42 * count * steps

@@ -273,6 +273,10 @@ class KernelSequence:
         """Make the calls from `first` to before `last`, counted over the rounds; other Python threads run meanwhile."""
         self._runner.run(self._address, None, first, last)
 
+    def run_once(self) -> None:
+        """Make the calls of the first round."""
+        self.run(0, len(self._calls))
+
 
 @cache
 def _runner() -> jit.Loaded:

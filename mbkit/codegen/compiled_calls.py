@@ -12,7 +12,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.codegen.compiled import Compiled
+from mbkit.codegen.compiled import Call as CallOf
+from mbkit.codegen.compiled import Compiled, KernelSequence
 from mbkit.codegen.python_call import FLOAT, POSITIVE, Step, python_call
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.steps.fixed import Part, parts_of, velocity_changes
@@ -155,18 +156,22 @@ class CompiledStep:
         self, q: Array, v: Array, tau: Array, dt: float, *behind: Array, threads: int | None
     ) -> tuple[Array, Array, bool]:
         """Return q and v after the step from one state or a batch, and whether all numbers on the way are finite."""
-        arrays, finite = self.everything(q, v, tau, np.full((*q.shape[:-1], 1), dt), *behind, threads=threads)
-        return arrays["q1"], arrays["v1"], finite
-
-    def everything(
-        self, q: Array, v: Array, tau: Array, dt: Array, *behind: Array, threads: int | None
-    ) -> tuple[dict[str, Array], bool]:
-        """Return what the parts of a step read and write, by name, and whether all of it is finite; dt (..., 1)."""
-        arrays = {"q": q, "v": v, "tau": tau, "dt": dt, "squares": np.zeros(dt.shape)}
-        arrays |= zip(self._extra, behind, strict=True)
+        arrays = {"q": q, "v": v, "tau": tau, "dt": np.full((*q.shape[:-1], 1), dt)}
+        arrays |= {"squares": np.zeros(arrays["dt"].shape), **dict(zip(self._extra, behind, strict=True))}
         finite = True
         for code, reads, writes in self._steps:
             results, good = code.call_checked(*(arrays[name] for name in reads), threads=threads)
             arrays |= zip(writes, (x[..., 0] for x in results), strict=True)
             finite &= good
-        return arrays, finite
+        return arrays["q1"], arrays["v1"], finite
+
+    def prepared(self, *given: Array) -> tuple[dict[str, Array], KernelSequence]:
+        """Return copies of q, v, tau, dt (N, 1) and what is behind, with results by name, and the calls on these."""
+        names = ("q", "v", "tau", "dt", *self._extra)
+        # One number after the other, of all states.
+        arrays = {name: np.array(x.T, order="C").T for name, x in zip(names, given, strict=True)}
+        arrays["squares"], calls = np.zeros((len(given[0]), 1)), []
+        for code, reads, writes in self._steps:
+            arrays |= {x: np.empty((rows, len(given[0]))).T for x, (rows, _) in zip(writes, code.shapes, strict=True)}
+            calls.append(CallOf(code, [arrays[x] for x in reads], [arrays[x] for x in writes]))
+        return arrays, KernelSequence(calls)

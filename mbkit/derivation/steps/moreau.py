@@ -42,13 +42,13 @@ def phase_margin(equations: Equations, which: Sequence[int], sides: Sequence[str
     of one that rests the part of its bound that is left, and 1 of one without a side; negative beyond. `sides` and
     `locks` are the parameters of their sides and of rotors at rest. The part reads the largest forces at rest,
     ``bound``. A margin is NaN where the parts of bounds are those of a linear program, as what rests follows from more
-    than one locked velocity.
+    than one locked velocity. As ``q2`` and ``w2`` it writes the end with what rests where it was at ``q``, to the bit.
     """
     model, space, names = equations.model, SymbolicSpace(equations.model), list(equations.model.parameters)
     place, time = {name: i for i, name in enumerate(names)}, model.time_parameter
 
     def make() -> ca.Function:
-        q, w, dt = ca.SX.sym("q1", model.nq), ca.SX.sym("w1", model.nv), ca.SX.sym("dt")
+        q, w, dt, start = (ca.SX.sym(x, n) for x, n in (("q1", model.nq), ("w1", model.nv), ("dt", 1), ("q", model.nq)))
         tau, given = ca.SX.sym("tau", equations.force.numel()), ca.SX.sym("parameters", len(names))
         values = [x + dt * (name == time) for name, x in zip(names, ca.vertsplit(given), strict=True)]
         locked, side = (ca.vertcat(*(values[place[x]] for x in of)) for of in (locks, sides))
@@ -56,12 +56,13 @@ def phase_margin(equations: Equations, which: Sequence[int], sides: Sequence[str
         still = (side == 0) * (bound > 0)
         pick = ca.DM(ca.Sparsity.triplet(len(which), model.nv, list(range(len(which))), list(which)), 1.0)
         ends = space.to_body_velocity(q, w)
-        v = (1 - ca.mtimes(pick.T, still)) * ends
+        rests = ca.mtimes(pick.T, still)
+        v = (1 - rests) * ends
         a = equations.function("forward_dynamics")(q, v, tau, ca.vertcat(*values))
         speeds = ca.mtimes(pick, v)
         if model.constrained:
             loose = [0.0 if name in {*locks} else x for name, x in zip(names, values, strict=True)]
-            needed = holding(equations, q, v, (1 - ca.mtimes(pick.T, still)) * a, tau, ca.vertcat(*loose))
+            needed = holding(equations, q, v, (1 - rests) * a, tau, ca.vertcat(*loose))
             moved = _ways(equations, which)(q, ca.vertcat(*values))
             used = _shared(ca.mtimes(pick, moved), ca.mtimes(moved.T, needed), bound, still, locked)
             # A joint that rows alone hold moves as soon as they do.
@@ -72,11 +73,13 @@ def phase_margin(equations: Equations, which: Sequence[int], sides: Sequence[str
             # What holds a joint accelerates its rotor.
             left = 1 + ROUNDING - RESTING * ca.fabs(ca.mtimes(pick, a)) / bound
         margins = choose(still, left, choose(side == 0, 1.0, side * speeds - STOPPED))
-        arguments = {"q1": q, "w1": w, "tau": tau, "dt": dt, "bound": bound, "parameters": given}
-        results = {"margin1": reduce(ca.fmin, ca.vertsplit(margins)), "margins1": margins}
-        return function_of("phase_margin", arguments, results)
+        results = [reduce(ca.fmin, ca.vertsplit(margins)), margins]
+        results += [choose(_places(model, rests), start, q), choose(rests, 0.0, w)]
+        arguments = dict(zip(reads, (start, q, w, tau, dt, bound, given), strict=True))
+        return function_of("phase_margin", arguments, dict(zip(writes, results, strict=True)))
 
-    return Part("phase_margin", ("q1", "w1", "tau", "dt", "bound", "parameters"), ("margin1", "margins1"), make)
+    reads, writes = ("q", "q1", "w1", "tau", "dt", "bound", "parameters"), ("margin1", "margins1", "q2", "w2")
+    return Part("phase_margin", reads, writes, make)
 
 
 def _ways(equations: Any, which: Sequence[int]) -> ca.Function:
@@ -279,7 +282,7 @@ def _held_parts(own: _Attempt) -> list[Part]:
         onto = projection(equations)
         _, v1, moved, _ = onto(q1, along, ca.SX.zeros(nv), *later)
         q1, v1, _, far = onto(q1, v1, moved, *later)
-        q1, v1 = choose(_places(own, holds), s["q"], q1), choose(own.spread(holds), 0.0, v1)
+        q1, v1 = choose(_places(equations.model, own.spread(holds)), s["q"], q1), choose(own.spread(holds), 0.0, v1)
         between = dependence(equations)(middle, *at(own.parameters(later=0.5 * h)))
         near = nears_singular(s["depends"], depends) * (s["depends"] > 0)
         lost = ca.logic_or(ca.logic_or(near, nears_singular(depends, between)), far * (1 - going) * (1 - turned))
@@ -323,12 +326,11 @@ def locked(A: Any, least: Any, holds: Any) -> Any:
     return ca.vertcat(*out)
 
 
-def _places(own: _Attempt, holds: Any) -> Any:
+def _places(model: Any, rests: Any) -> Any:
     """Return which coordinates keep their place: joints whose forces jump have one for each velocity."""
-    model, out = own.equations.model, ca.SX.zeros(own.equations.model.nq)
-    moved = own.spread(holds)
+    out = ca.SX.zeros(model.nq)
     for joint in model.independent_joints:
         q, v = model.layout.q[joint.name], model.layout.v[joint.name]
         if q.stop - q.start == v.stop - v.start:
-            out[q] = moved[v]
+            out[q] = rests[v]
     return out

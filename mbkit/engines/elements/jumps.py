@@ -260,14 +260,15 @@ class Jumps(AddedForce):
     def responses(self, dyn: Any, q: Array) -> Array:
         """Return the accelerations of joints per force on each of them, (nv, nv) or (N, nv, nv)."""
         M = np.asarray((dyn._bare or dyn).mass_matrix(q))
-        # Differences of accelerations have the rounding of the largest, by which a joint at its dead centre loses all.
-        N = self.directions(dyn, q) if self._constrained else np.eye(M.shape[-1])
         try:
+            if not self._constrained:
+                return np.linalg.inv(M)
+            # Differences of accelerations have the rounding of the largest, by which a joint at its dead centre loses
+            # all.
+            N = self.directions(dyn, q)
             out = np.asarray(N @ np.linalg.solve(N.mT @ M @ N, N.mT))
         except np.linalg.LinAlgError:
             raise NumericalError(_UNDECIDED.format(n=M.shape[-1])) from None
-        if not self._constrained:
-            return out
         # A joint that loops hold responds by rounding alone, of either sign; the least response keeps A definite.
         masses, own = (np.einsum("...ii->...i", x) for x in (M, out))
         own[...] = np.maximum(own, PROXIMAL_SHIFT / np.where(masses > 0, masses, np.inf))

@@ -125,11 +125,15 @@ _MAX_BLOCK_STEPS: Final = 2048
 _MAX_CHUNK_STATES: Final = 1032
 # Name that a step writes -> name that the next one reads.
 _STATE: Final = {"q1": "q", "w1": "w", "squares1": "squares", "margin1": "margin"}
+#: The same where a part behind the step changes its end.
+_CHANGED: Final = {"q2": "q", "w2": "w", "squares1": "squares", "margin1": "margin"}
 
 
 def _widest(plan: Plan) -> int:
     """Return how many states the cache holds with all that belongs to them, from 72 to 1032."""
-    return min(max(padded(CACHE // (8 * sum(plan.sizes.values()))), 9 * LANES), _MAX_CHUNK_STATES)
+    # Margins of each velocity are for the search of an end, and nobody reads them here.
+    sizes = sum(rows for name, rows in plan.sizes.items() if name != "margins1")
+    return min(max(padded(CACHE // (8 * sizes)), 9 * LANES), _MAX_CHUNK_STATES)
 
 
 class Chunk(BlockLoop):
@@ -152,7 +156,8 @@ class Chunk(BlockLoop):
         clock: int | None = None,
     ) -> None:
         #: Name that a step writes -> name that the next one reads, or the host.
-        state = {name: before for name, before in _STATE.items() if name in plan.sizes}
+        every = _CHANGED if "q2" in plan.sizes else _STATE
+        state = {name: before for name, before in every.items() if name in plan.sizes}
         sizes = {state.get(name, name): rows for name, rows in plan.sizes.items()}
         own = [*state.values(), *(["tau"] if torques else []), *([] if clock is None else ["parameters"])]
         fits = CACHE // (8 * padded(most) * sum(sizes[name] for name in own))

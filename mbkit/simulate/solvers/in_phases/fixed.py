@@ -33,10 +33,12 @@ Solver = Callable[[IntegrationProblem], SolverResult]
 #: Phases in a row that end where they begin, at most.
 MAX_EMPTY_PHASES: Final = 20
 UNDECIDED: Final = "stopped, as which joints rest cannot be decided"
-#: Steps of a block, at least, and the factor by which blocks grow while nothing changes.
+#: Steps of a block, at least, and the factor by which blocks grow.
 _BLOCK, _GROWTH = 32, 4
-#: States that machine code takes in the time in which a block is set up.
-_SET_UP: Final = 2**10
+#: Steps of states in the time of a block's set-up and of its changes, by machine code and in Python.
+_SET_UP: Final = {True: 2**13, False: 2**5}
+#: States side by side that machine code steps in the time of one.
+_LANES: Final = 8
 #: States of a block, at most.
 _MOST_STATES: Final = 2**16
 #: Fraction of a step before which the end of a phase is not searched.
@@ -118,8 +120,9 @@ class _Members:
         dyn = self.phases.dyn._of_samples(self.members) if self.side_by_side else self.phases.dyn
         self.v = self.phases.stopped(dyn, start, self.q, self.v, self.v == 0)
         self._phase = self.begin(rows, start)
-        self._shortest = max(_BLOCK, _SET_UP // len(rows) if self._compiled(self._phase.dyn) else 0)
-        self._window, parts = self._shortest, len(self.problem.q) // len(self.k)
+        parts = len(self.problem.q) // len(self.k)
+        #: Ends of phases for each step of a trajectory in the last block, and the steps of the next one at most.
+        self._ends = 0.0, 2 * _BLOCK
         while record.error is None and self._going.any():
             self._block()
             self._going &= self.k < grid.steps
@@ -196,7 +199,7 @@ class _Members:
         if not left.any():
             return rows, left + 1, 1, grid.last
         rows, left = rows[left > 0], left[left > 0]
-        n = min(self._window, int(left.max()), max(_MOST_STATES // len(rows), _BLOCK))
+        n = min(self._window(len(rows)), int(left.max()), max(_MOST_STATES // len(rows), _BLOCK))
         if self._timed:
             # Up to where the next ones stand.
             ahead = left.max() - left[left < left.max()]
@@ -230,9 +233,9 @@ class _Members:
             times: Any = start + np.arange(1, q.shape[1]) * h
             margins = self._margins_of(phase, times, q[0, 1:], v[0, 1:])
         good = self._good(rows, phase, q, v, margins, limit, start, h)
-        self._window = self._next_window(good, good < limit)
+        self._ends = float((good < limit).sum() / max(good.sum(), 1)), n * _GROWTH
         last = np.arange(len(rows)), good
-        if phase.still.any():
+        if phase.still.any() and not (compiled and self.side_by_side):
             # What rests keeps its place and no velocity, to the bit.
             np.copyto(q, q[:, :1].copy(), where=self.phases.places(phase.still)[:, None])
             np.copyto(v, 0.0, where=phase.still[:, None])
@@ -256,9 +259,12 @@ class _Members:
         # States behind the end of a phase are written again.
         return True, record.q[which, first : first + n + 1], record.v[which, first : first + n + 1]
 
-    def _next_window(self, good: Indices, changed: Mask) -> int:
-        """Return the steps of the next block: more where few phases end, as steps behind an end are in vain."""
-        return int(np.clip(_GROWTH * good.mean() * (1 - changed.mean()) ** 3, self._shortest, _MOST_STATES))
+    def _window(self, count: int) -> int:
+        """Return the steps of a block: longer ones are set up less often, but steps behind ends are in vain."""
+        compiled, (rate, most) = self._compiled(self._phase.dyn), self._ends
+        together = max(count, _LANES) if compiled else count
+        best = np.sqrt(2 * _SET_UP[compiled] / (rate * together)) if rate else np.inf
+        return int(np.clip(best, _BLOCK, most))
 
     def _compiled(self, dyn: Dynamics) -> bool:
         """Return whether the margins of states are machine code with the steps."""
@@ -275,7 +281,7 @@ class _Members:
         dyn: Any = phase.dyn
         part, k = self.margin_part, self.k[0] + np.arange(len(q))
         force = self.problem.torque.rows(k, self._alone)
-        states = q, Space(dyn.model).to_integrator_velocity(q, v), force, np.zeros((1, 1))
+        states = q, q, Space(dyn.model).to_integrator_velocity(q, v), force, np.zeros((1, 1))
         given = (
             np.broadcast_to(x, (len(q), np.shape(x)[1]))
             for x in (*states, self.phases.bounds(phase), with_time(dyn, t))
@@ -364,7 +370,8 @@ class _Members:
         if not len(rows):
             return
         grid, whole, phase = self.problem.grid, rows, self._phase.take(rows)
-        start, left = (np.array([f(k) for k in self.k[rows].tolist()]) for f in (grid.time, grid.step))
+        k = self.k[rows]
+        start, left = grid.times_of(k), np.where(k == grid.steps - 1, grid.last, grid.dt)
         while len(rows):
             part, every = _PartOfStep(self, rows, phase, start), np.arange(len(rows))
             q, v, margins = part.ahead(every, left)
@@ -376,13 +383,13 @@ class _Members:
             if not len(rows):
                 break
             s, faded = part.ends(every, left, margins[over])
-            q, v, _ = part.ahead(every, s)
+            state = part.ahead(every, s)
             self._record.steps += len(rows)
             moved = s >= _FROM * left
             start, left = start + s, left - s
             # A drive that has ended by the end of the step does so within rounding where its speed is zero first.
             later = start + np.where(faded, left, 0.0)
-            phase, decided = self._following(rows, phase.take(every), start, later, (q, v), moved, s > 0)
+            phase, decided = self._following(rows, phase.take(every), start, later, state, moved, s > 0)
             if not decided.all():
                 rows, start, left = rows[decided], start[decided], left[decided]
                 phase = phase.take(np.flatnonzero(decided))
@@ -401,15 +408,15 @@ class _Members:
         before: Phase,
         t: Array,
         later: Array,
-        state: tuple[Array, Array],
+        state: tuple[Array, Array, Array],
         moved: Mask,
         pushed: Mask,
     ) -> tuple[Phase, Mask]:
         """Go to the ends of phases at t; return the next ones, as it is `later`, and which of them can be decided.
 
-        `moved` tells that time has passed, `pushed` that it has at least begun to.
+        `state` has margins behind q and v; `moved` tells that time has passed, `pushed` that it has at least begun to.
         """
-        v, leaving = self.phases.after(before, self.times(t), *state, self.forces(rows))
+        v, leaving = self.phases.after(before, self.times(t), *state[:2], self.forces(rows), state[2])
         self._empty[rows] = np.where(moved, 0, self._empty[rows] + 1)
         decided = self._empty[rows] <= MAX_EMPTY_PHASES
         for i, time in zip(rows[~decided].tolist(), t[~decided].tolist(), strict=True):
@@ -417,11 +424,10 @@ class _Members:
         self.q[rows], self.v[rows] = state[0], v
         # A joint that let go and came to rest at once did not let go.
         after = self.begin(rows, self.times(later), leaving * (moved | pushed)[:, None])
-        for i, name in self.phases.changes(before, after):
-            if decided[i]:
-                row = rows[i]
-                at = float(t[i]), self.q[row].copy(), self.v[row].copy()
-                self._record.events.append(Hit(name, *at, self.problem.member(int(self.members[row]))))
+        members = [self.problem.member(i) for i in self.members[rows].tolist()]
+        at = [*zip(t.tolist(), self.q[rows], self.v[rows], members, strict=True)]
+        changes = self.phases.changes(before, after)
+        self._record.events += [Hit(name, *at[i]) for i, name in changes if decided[i]]
         return after, decided
 
 
@@ -447,26 +453,24 @@ class _PartOfStep:
         self._run, self._rows, self.phase, self._t = run, rows, phase, t
         self._force = run.forces(rows)
         self._method = method_of(run.problem.method)
-        #: Parameters that a step reads, where it is machine code with the margins of its end.
-        self._values: Array | None = None
+        #: What a step reads and writes, where it is machine code with the margins of its end.
+        self._arrays: dict[str, Array] = {}
         dyn: Any = phase.dyn
         timed = dyn.model.time_parameter
         if run._compiled(dyn):
-            self._code, self._threads = dyn._step_with(run.problem.method, run.margin_part), dyn.threads
-            self._values, self._bound = with_time(dyn, t), run.phases.bounds(phase)
+            n, code = len(rows), dyn._step_with(run.problem.method, run.margin_part)
+            more = (np.broadcast_to(x, (n, x.shape[1])) for x in (run.phases.bounds(phase), with_time(dyn, t)))
+            self._arrays, self._calls = code.prepared(run.q[rows], run.v[rows], self._force, np.zeros((n, 1)), *more)
         self._stepped = self._method.explicit and timed is None and not callable(self._force)
 
     def ahead(self, i: Indices, s: Array) -> tuple[Array, Array, Array]:
         """Return the states after s seconds, by one step of the method, and their margins, (m, k)."""
-        run, phase = self._run, self.phase if len(i) == len(self._rows) else self.phase.take(i)
-        force = self._force if callable(self._force) else self._force[i]
-        q, v = run.q[self._rows[i]], run.v[self._rows[i]]
-        if self._values is not None:
-            given = q, v, force, s[:, None], self._bound[i], self._values[i]
-            arrays, finite = self._code.everything(*given, threads=self._threads)
-            if finite:
-                return *run.phases.held(phase.still, q, arrays["q1"], arrays["v1"]), arrays["margins1"]
-        ends = q.copy(), v.copy()
+        run, (q, v) = self._run, (x[self._rows[i]] for x in (self._run.q, self._run.v))
+        if (margins := self._by_code(i, s)) is not None:
+            ends = self._arrays["q1"][i], self._arrays["v1"][i]
+            return *run.phases.held(self.phase.still[i], q, *ends), margins
+        phase = self.phase if len(i) == len(self._rows) else self.phase.take(i)
+        force, ends = self._force if callable(self._force) else self._force[i], (q.copy(), v.copy())
         for j in np.flatnonzero(s > 0):
             own, one = phase.take(np.array([j])), slice(j, j + 1)
             start, length = float(self._t[i[j]]), float(s[j])
@@ -480,6 +484,19 @@ class _PartOfStep:
         margins = run.phases.margins(phase, run.times(self._t[i] + s), *ends, force)
         return *run.phases.held(phase.still, q, *ends), margins
 
+    def _by_code(self, i: Indices, s: Array) -> Array | None:
+        """Return the margins after s seconds by machine code, (m, k); None where there is none."""
+        if not self._arrays:
+            return None
+        self._arrays["dt"][i, 0] = s
+        self._calls.run_once()
+        out = [self._arrays[name][i] for name in ("margins1", "q1", "v1")]
+        return out[0] if all(np.isfinite(x).all() for x in out) else None
+
+    def _margins(self, i: Indices, s: Array) -> Array:
+        found = self._by_code(i, s)
+        return self.ahead(i, s)[2] if found is None else found
+
     def ends(self, i: Indices, length: Array, over: Array) -> tuple[Array, Mask]:
         """Return after how many seconds phases end, before `length`, where margins are `over`; 0 if they do at once.
 
@@ -487,12 +504,12 @@ class _PartOfStep:
         """
         first = _FROM * length
         noise = EPS * (1 + np.abs(self._run.v[self._rows[i]]).max(axis=1))
-        soon = self.ahead(i, first)[2]
+        soon = self._margins(i, first)
         now = np.full(soon.shape, np.inf)
         # A joint that rests at its bound to the last bits, and is pulled more and more, lets go in the next instant.
         at_once = soon.min(axis=1) <= -noise
         if at_once.any():
-            now[at_once] = self.ahead(i[at_once], 0 * length[at_once])[2]
+            now[at_once] = self._margins(i[at_once], 0 * length[at_once])
         low, high = np.where(at_once, 0.0, first), np.where(at_once, first, length)
         # A speed that is zero at the end may have faded out long before.
         faded = over.min(axis=1) > -noise
@@ -503,7 +520,7 @@ class _PartOfStep:
 
         def margins(x: Array, j: Indices) -> Array:
             k = open_[j]
-            return self.ahead(i[k], low[k] + x * (high - low)[k])[2] / unit[k]
+            return self._margins(i[k], low[k] + x * (high - low)[k]) / unit[k]
 
         if len(open_):
             found = first_zero(margins, before[open_], after[open_])

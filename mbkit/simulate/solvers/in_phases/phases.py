@@ -310,12 +310,14 @@ class Phases:
         bound = self._own.law_of(phase.rubbed).bound[..., self.which]
         return np.broadcast_to(bound, (*phase.still.shape[:-1], len(self.which)))
 
-    def after(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> tuple[Array, Array]:
+    def after(
+        self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force, margins: Array | None = None
+    ) -> tuple[Array, Array]:
         """Return the velocity at the end of a phase, zero of what stopped there, and the signs of what lets go.
 
         Those velocities end their phase that have the least margins, to rounding.
         """
-        margins = self.margins(phase, t, q, v, force)
+        margins = self.margins(phase, t, q, v, force) if margins is None else margins
         ended = np.zeros(v.shape, dtype=bool)
         ended[..., self.which] = margins <= np.maximum(margins.min(axis=-1, keepdims=True), 0.0) + 1e-15
         lets_go = ended & phase.still
