@@ -221,7 +221,7 @@ def test_loops_that_cannot_be_are_refused_with_the_reason() -> None:
     ):
         with pytest.raises(ModelError, match=words):
             four_bar(**loop)
-    with pytest.raises(InputError, match=r"q0: the constraints of four_bar ask for f = 0"):
+    with pytest.raises(InputError, match=r"q0: four_bar is open there: loop 'pin' .* by .*; project\("):
         mb.simulate(mb.dynamics(four_bar(), "lagrangian"), zero, zero, 0.1, "rk4", dt=1e-3)
     # Loops that never close have no mobility.
     b = hinge(com=(0.5, 0, 0))

@@ -542,6 +542,15 @@ def test_a_random_state_hangs_little_on_its_draw(monkeypatch) -> None:
     assert np.linalg.norm(moved, axis=1).max() < 1e3 * np.linalg.norm(aside)
 
 
+def test_random_states_are_off_singular_poses_and_need_no_projection(monkeypatch) -> None:
+    """Rounding would choose where a projection from afar ends."""
+    model = mb.catalog.five_bar()
+    manifold = states_of(model).manifold
+    monkeypatch.setattr(type(manifold), "project", None)
+    least = 0.3 * manifold.apartness(manifold.equations.row_choice.closed)
+    assert min(manifold.apartness(q) for q in model.random_state(0, 30)[0]) > least
+
+
 def test_random_states_of_many_loops_are_found_nearer_to_a_closed_one_and_are_not_all_there() -> None:
     assert np.isfinite(mb.catalog.bricard().random_state(0, 2)[0]).all()
     assert 0.2 < np.std(mb.catalog.four_bars(n=6).random_state(0, 12)[0], axis=0).mean() < 2.0

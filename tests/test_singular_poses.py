@@ -527,6 +527,38 @@ def test_a_pose_in_any_step_of_a_run_is_told(method, steps, compiled) -> None:
         assert not told
 
 
+@pytest.mark.parametrize("method", ["implicit_midpoint", "gauss4"])
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_run_tells_its_poses_whatever_it_saves(compiled, method) -> None:
+    """The implicit midpoint rule told those of states that were kept alone."""
+    motion, dt = kite_motion(), 2e-3
+    # The second one moves away from the pose.
+    starts = [motion.at(-5.3 * dt), motion.at(0.4 * dt), motion.at(-4.3 * dt)]
+    q, v = (np.array(x) for x in zip(*starts, strict=True))
+    dyn = kite(compile=compiled)
+    _, told = simulated(dyn, q, v, 12 * dt, method, dt=dt, save=[0.0, 12 * dt])
+    assert "2 of 3 trajectories passed singular poses; trajectory 0" in told
+    for k, when in ((0, 5.3 * dt), (2, 4.3 * dt)):
+        _, told = simulated(dyn, q[k], v[k], 12 * dt, method, dt=dt, save=[12 * dt])
+        assert float(told.split("t = ")[1].split(" ")[0]) == pytest.approx(when, abs=2e-2 * dt)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+@pytest.mark.parametrize("start", [(0.82, -2.76), (-2.75, -5.8), (1.88, 4.95)])
+def test_poses_are_told_however_long_the_steps_are(n, start) -> None:
+    """Those of 0.3 s passed most of them without a word; where both cells lie flat two combinations of rows vanish."""
+    dyn = row(n)
+    run, told = simulated(dyn, *parallel(dyn, *start), 3.0, "rk853", rtol=1e-3)
+    t = np.linspace(0.0, 3.0, 301)
+    cells = np.floor((motion(n, t, *start) - FLAT) / math.pi)
+    passed = t[1:][np.diff(cells) != 0]
+    assert np.diff(run.t).max() > 0.3
+    assert len(passed) > 1
+    times, later, _ = told.partition("t = ")[2].partition(" (s)")[0].partition(" and later")
+    assert [float(x) for x in times.split(", ")] == pytest.approx(passed[:3], abs=0.2)
+    assert bool(later or len(passed) <= 3)
+
+
 @pytest.mark.thorough(every=18)
 @pytest.mark.parametrize("place", [-1e-9, 0.3, 1e-2, -1e-3, 1e-4, -1e-5, 1e-6, 0.0])
 @pytest.mark.parametrize("held", [False, True])

@@ -60,8 +60,8 @@ _SINGULAR: Final = 1e-9
 #: Residual of a closed configuration, in terms of its rows' size; what is open by more closes elsewhere, or nowhere.
 _CLOSED: Final = 1e-13
 #: Poses beside a closed one, and how far they are away, rad or m.
-_BESIDE: Final = 3
-_ASIDE: Final = 0.2
+BESIDE: Final = 3
+ASIDE: Final = 0.2
 
 
 # Rows of loops, of motions in time and of contacts without slip
@@ -338,9 +338,9 @@ class _Numbers:
         J = self(q)[1][kept]
         yield _Pose(*independent_rows(J, len(held)), q)
         free = np.linalg.svd(J)[2][len(independent_rows(J, len(held))[0]) :]
-        moving = np.argsort(-np.linalg.norm(free, axis=0).round(6), kind="stable")[:_BESIDE] if len(free) else ()
+        moving = np.argsort(-np.linalg.norm(free, axis=0).round(6), kind="stable")[:BESIDE] if len(free) else ()
         for i in moving:
-            x = self.closed(integrate(self.model, q, _ASIDE * np.eye(len(J.T))[i]), held, [i])
+            x = self.closed(integrate(self.model, q, ASIDE * np.eye(len(J.T))[i]), held, [i])
             if x is not None and np.isfinite(self(x)[1]).all():
                 yield _Pose(*independent_rows(self(x)[1][kept], len(held)), x)
 
@@ -438,16 +438,11 @@ def singular_mass_matrix(model: Model) -> bool:
     """Return whether M of the tree has no inverse, or is not known, at the model's nominal numbers."""
     if any(x is None for x in model.parameters.values()):
         return True
-    return _least_part(sample_mass_matrix(model)) < _SINGULAR
-
-
-def _least_part(M: Array) -> float:
-    """Return the smallest eigenvalue of a mass matrix once its diagonal is scaled to one; 0 where that is not done."""
-    diagonal = np.diag(M)
-    if not (np.isfinite(M).all() and (diagonal > 0).all()):
-        return 0.0
-    root = np.sqrt(diagonal)
-    return max(float(np.linalg.eigvalsh(M / root[:, None] / root)[0]), 0.0)
+    M = sample_mass_matrix(model)
+    if not (np.isfinite(M).all() and (np.diag(M) > 0).all()):
+        return True
+    root = np.sqrt(np.diag(M))
+    return bool(np.linalg.eigvalsh(M / root[:, None] / root)[0] < _SINGULAR)
 
 
 class ConstraintQuantities:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import CONSISTENT, ROUNDING, Array, batch_of
+from mbkit._check import CONSISTENT, EPS, ROUNDING, Array, batch_of
 from mbkit._imports import from_above
 from mbkit._reproducible import dependent, unit_rows
 from mbkit.engines.evaluation import Evaluation
@@ -18,6 +18,9 @@ from mbkit.model.elements.paths import ALL, Path
 
 #: Words of each error of such a pose: no shorter step helps there.
 AT_SINGULAR_POSE: Final = "at a singular pose"
+#: Of the largest singular value of J, the smallest one at a singular pose: there v̇ from the equation of motion loses as
+#: many digits, eps/σ, as that of the pose itself is off, σ. So it is no `DEPENDENT`, where no digit is left.
+AT_POSE: Final = float(np.sqrt(EPS))
 #: Least entry, in the unit vector of the smallest singular value, of a row that depends on others.
 TAKES_PART: Final = 0.1
 ASKED: Final = frozenset({"row", "speed"}), "it has no loops and no other constraints (add_loop, or constraints=[...])"
@@ -134,9 +137,7 @@ class Constrained(Evaluation):
         broken = follows & (left > CONSISTENT * np.maximum(1.0, np.abs(v).max(axis=-1, keepdims=True)))
         for k in np.flatnonzero(broken.any(axis=-1))[:1].tolist():
             still = self._states_held.manifold_of(self).member(k).still_open(q[k % len(q)], v[k % len(v)])
-            raise InputError(
-                f"v: {self.model.name}: no velocity satisfies all constraints: open stay {', '.join(still)}"
-            )
+            raise InputError(f"v: {self.model.name}: no velocity satisfies all constraints: open stay {still}")
 
     def _warn_if_inconsistent(self, q: ArrayLike, v: ArrayLike | None = None) -> None:
         if self._state_unchecked:

@@ -9,19 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._attributes import forwarded
-from mbkit._check import CONSISTENT, EPS, ROUNDING, Array
-from mbkit._reproducible import dependent, independent_rows, pivoted, singular_values, under_rows, unit_rows
-from mbkit.derivation.constraints import starts
+from mbkit._check import CONSISTENT, ROUNDING, Array
+from mbkit._reproducible import independent_rows, pivoted, singular_values, under_rows, unit_rows
+from mbkit.derivation.constraints import ASIDE, BESIDE, starts
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, projection
 from mbkit.engines.base import Dynamics, at_time
-from mbkit.engines.constrained import ROWS, singular_pose
+from mbkit.engines.constrained import AT_POSE, ROWS, singular_pose
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Model
@@ -30,9 +30,6 @@ from mbkit.model.manifold import closest_configuration, least_change
 
 #: Rounds of the projection's iterations.
 _ROUNDS: Final = 8
-#: Of the largest singular value of J, the smallest one at a singular pose: there v̇ from the equation of motion loses as
-#: many digits, eps/σ, as that of the pose itself is off, σ. So it is no `DEPENDENT`, where no digit is left.
-AT_POSE: Final = float(np.sqrt(EPS))
 #: Steps of the search for a foot.
 _MOST: Final = 200
 _TWIN: Final = "_constrained_twin"
@@ -72,28 +69,9 @@ def _function(eq: Any, name: str) -> ca.Function:
     return ca.Function(name, list(inputs.values()), dense, list(inputs), list(outputs), {"cse": True})
 
 
-class _Terms(NamedTuple):
-    """Numbers at one state: f (k,), J (m, n), rates (m,), and M (n, n)."""
-
-    f: Array
-    J: Array
-    rate: Array
-    M: Array
-
-    @property
-    def scale(self) -> Array:
-        """What a row changes by when every coordinate changes by 1."""
-        return _scale(self.J)
-
-    @property
-    def held(self) -> Array:
-        """J of the rows that hold positions."""
-        return self.J[: len(self.f)]
-
-
 def _scale(J: Array) -> Array:
     sizes = np.abs(J).sum(axis=-1)
-    # A row that has no slope at a singular pose is as large as the others all the same.
+    # Of a row that has no slope at a singular pose the rounding of the others is left.
     sizes = np.maximum(sizes, AT_POSE * sizes.max(axis=-1, keepdims=True, initial=0.0))
     return np.asarray(np.where(sizes > 0, sizes, 1.0))
 
@@ -131,24 +109,35 @@ class Manifold:
         """Return J of all rows, redundant ones among them."""
         return self.call("all_rows", q)[1]
 
-    def still_open(self, q: Array, v: Array | None = None) -> list[str]:
-        """Return the rows that stay open where the independent rows are zero: dependent ones, and half a turn.
+    def still_open(self, q: Array, v: Array | None = None) -> str:
+        """Return the rows that are not zero, with v those too whose rates are not; empty where all is closed.
 
-        With v, those too whose rates are not zero. A dependent row is named with those that it contradicts.
+        A dependent row is named with those that it contradicts; a loop may be half a turn off where its rows are zero.
         """
-        f, J, ways, by_time = self.call("all_rows", q)
-        rates = [] if v is None else [(J @ v + by_time[:, 0], v, " per second")]
+        sides, J, ways = self._left(q, v)
         every, kept = self.equations.all_constraints.names, np.array(self.equations.row_choice.independent, dtype=int)
         rows = []
-        for left, x, unit in ((f[:, 0], q, ""), *rates):
-            scale = np.maximum(np.abs(J[: len(left)]).sum(axis=1), 1.0) * max(1.0, float(np.abs(x).max(initial=0.0)))
-            for k in np.flatnonzero(~(np.abs(left) <= CONSISTENT * scale)):
-                against = ", ".join(every[i] for i in needed(J, kept, [int(k)])) if k not in kept else ""
+        for unit, (left, is_open) in zip(("", " per second"), sides, strict=False):
+            for k in np.flatnonzero(is_open).tolist():
+                against = ", ".join(every[i] for i in needed(J, kept, [k])) if k not in kept else ""
                 rows.append(f"{every[k]} by {left[k]:.3g}{unit}{against and f' against {against}'}")
         model = self.dyn.model
         turned = [f"loop {x.name!r} half a turn off" for x in model.loops]
         turned += [f"no slip {x.name!r}, whose disc lies flat" for x in discs_of(model)]
-        return rows or [text for text, way in zip(turned, ways[:, 0], strict=True) if way < 0]
+        return ", ".join(rows or [text for text, way in zip(turned, ways, strict=True) if way < 0])
+
+    def _left(self, q: Array, v: Array | None) -> tuple[list[tuple[Array, NDArray[np.bool_]]], Array, Array]:
+        """Return f and, with v, the rates of all rows, each with which of them are open; J; and the ways of loops.
+
+        Of one state or each of a batch.
+        """
+        f, J, ways, by_time = self.call("all_rows", q)
+        sides = [(f[..., 0], q)] if v is None else [(f[..., 0], q), ((J @ v[..., None] + by_time)[..., 0], v)]
+        out = []
+        for left, x in sides:
+            size = np.maximum(1.0, np.abs(x).max(axis=-1, keepdims=True, initial=0.0))
+            out.append((left, ~(np.abs(left) <= CONSISTENT * _scale(J)[..., : left.shape[-1]] * size)))
+        return out, J, ways[..., 0]
 
     def value(self, q: Array) -> Array:
         """Return f of the rows that hold positions, (k,) or (N, k)."""
@@ -162,34 +151,25 @@ class Manifold:
         """Return λ, (m,) or (N, m)."""
         return np.asarray(self.call("multipliers", q, v, tau)[0][..., 0])
 
-    def _terms(self, q: Array, v: Array) -> _Terms:
+    def terms(self, q: Array, v: Array) -> tuple[Array, Array, Array, Array]:
+        """Return f of the rows that hold positions, then J and the rates of the independent rows, and M."""
         f, J, rate, M = self.call("constraint", q, v)
-        return _Terms(f[:, 0], J, rate[:, 0], M)
+        return f[:, 0], J, rate[:, 0], M
 
     # Consistency
 
     def check(self, q: Array, v: Array) -> None:
-        """Refuse an inconsistent state, of one or a batch, with the residuals (InputError)."""
-        states = np.atleast_2d(q), np.atleast_2d(v)
-        f, J, rate, _ = self.call("constraint", *states)
-        rows = CONSISTENT * _scale(J)
-        for name, what, left, x in zip(("q0", "v0"), ("f", "J v + c"), (f[..., 0], rate[..., 0]), states, strict=True):
-            most = rows[:, : left.shape[1]] * np.maximum(1.0, np.abs(x).max(axis=1))[:, None]
-            for k in np.flatnonzero(~(np.abs(left) <= most).all(axis=1)).tolist():
-                where = "" if q.ndim == 1 else f" of state {k}"
-                closed = closed_near(self.member(k).dyn, states[0][k])
-                raise InputError(
-                    f"{name}: the constraints of {self.dyn.model.name} ask for {what} = 0, which is "
-                    f"{_residuals(left[k])}{where}; project(q0, v0) returns the nearest consistent state; {closed}"
-                )
-        f, J, ways, by_time = self.call("all_rows", states[0])
-        left = np.concatenate([np.abs(f), np.abs(J @ states[1][..., None] + by_time)], axis=1)
-        for k in np.flatnonzero((left > CONSISTENT).any(axis=(1, 2)) | (ways < 0).any(axis=(1, 2))).tolist():
-            own = self.member(k)
-            if still := own.still_open(states[0][k], states[1][k]):
-                where = "" if q.ndim == 1 else f" of state {k}"
-                closed = closed_near(own.dyn, states[0][k])
-                raise InputError(f"q0: {self.dyn.model.name} is open there{where}: {', '.join(still)}; {closed}")
+        """Refuse an inconsistent state, of one or a batch, with what is left of its rows (InputError)."""
+        places, rates = np.atleast_2d(q), np.atleast_2d(v)
+        ((_, off), (_, fast)), _, ways = self._left(places, rates)
+        off_place = np.asarray(off.any(axis=1) | (ways < 0).any(axis=1))
+        for k in np.flatnonzero(off_place | fast.any(axis=1)).tolist()[:1]:
+            own, where = self.member(k), "" if q.ndim == 1 else f" in state {k}"
+            raise InputError(
+                f"{'q0' if off_place[k] else 'v0'}: {self.dyn.model.name} is open there{where}: "
+                f"{own.still_open(places[k], rates[k])}; project(q0, v0) returns the nearest consistent state; "
+                f"{closed_near(own.dyn, places[k])}"
+            )
 
     def member(self, k: int) -> Manifold:
         """Return the states of one sample of a batch of parameters; the same where there is none."""
@@ -242,12 +222,12 @@ class Manifold:
         The velocities `held`, and what they move, stay as they are.
         """
         free, x, model = self._free(held), self.restored(q, held), self.dyn.model
-        M = self._terms(q, v).M[np.ix_(free, free)]
+        M = self.terms(q, v)[3][np.ix_(free, free)]
         # Stationary: M (x - q) + Jᵀ μ = 0 with f(x) = 0.
         last, length, step = np.inf, 1.0, np.zeros(model.nv)
         for _ in range(_MOST):
-            terms = self._terms(x, v)
-            step[free] = under_rows(M, terms.held[:, free], M @ model.difference(x, q)[free], -terms.f)[0]
+            f, J, *_ = self.terms(x, v)
+            step[free] = under_rows(M, J[: len(f), free], M @ model.difference(x, q)[free], -f)[0]
             size = float(np.linalg.norm(step))
             if size <= ROUNDING * (1 + float(np.linalg.norm(x))):
                 break
@@ -255,10 +235,10 @@ class Manifold:
             length = min(1.0, 1.1 * length) if size < last else 0.5 * length
             x, last = model.integrate(x, length * step), size
         x = self.restored(x, held)
-        terms = self._terms(x, v)
-        v = v + least_change(terms.M, terms.J, -terms.rate, held)
+        _, J, rate, M = self.terms(x, v)
+        v = v + least_change(M, J, -rate, held)
         if not held and (still := self.still_open(x, v)):
-            raise InputError(f"v: {model.name}: no velocity satisfies all constraints: open stay {', '.join(still)}")
+            raise InputError(f"v: {model.name}: no velocity satisfies all constraints: open stay {still}")
         return x, v
 
     def apartness(self, q: Array) -> float:
@@ -275,20 +255,18 @@ class Manifold:
 
     def require_followed(self, q: Array, v: Array, held: Collection[int], names: str) -> None:
         """Refuse held coordinates that break the constraints at a state, or leave the others undetermined there."""
-        model, terms = self.dyn.model, self._terms(q, v)
-        for what, left, x in (("f", terms.f, q), ("J v + ∂f/∂t", terms.rate, v)):
-            most = CONSISTENT * terms.scale[: len(left)] * max(1.0, float(np.abs(x).max(initial=0.0)))
-            if len(bad := np.flatnonzero(~(np.abs(left) <= most))):
-                raise InputError(
-                    f"hold: {names} held, the constraints of {model.name} cannot be met: {what} = "
-                    f"{_residuals(left[bad])} is left of {_named(bad, self)}; hold fewer coordinates, or other values"
-                )
-        free, rng = self._free(held), np.random.default_rng(0)
-        J = (terms.J / np.linalg.norm(terms.J, axis=1, keepdims=True))[:, free]
+        model = self.dyn.model
+        if still := self.still_open(q, v):
+            raise InputError(
+                f"hold: {names} held, the constraints of {model.name} cannot be met: open stay {still}; hold fewer "
+                "coordinates, or other values"
+            )
+        free, J = self._free(held), self.jacobian(q)
+        J = (J / np.linalg.norm(J, axis=1, keepdims=True))[:, free]
         # A row of held coordinates alone, such as a drive's, says nothing of the others at any pose.
-        beside = [self.jacobian(model.integrate(q, _ASIDE * rng.standard_normal(model.nv))) for _ in range(_BESIDE)]
-        moving = np.flatnonzero(np.max([np.abs(x[:, free]).max(axis=1, initial=0.0) for x in beside], axis=0) > 0)
-        if len(moving) and len(lost := _dependent(J[moving])[0]):
+        slopes = [np.abs(self.jacobian(x)[:, free]).max(axis=1, initial=0.0) for x in _around(model, q)]
+        moving = np.flatnonzero(np.max(slopes, axis=0) > 0)
+        if len(lost := _lost(J[moving])):
             raise InputError(
                 f"hold: {names} held, the other coordinates of {model.name} are not determined at this pose: "
                 f"{_named(moving[lost], self)} has no slope or depends on other rows; hold other coordinates"
@@ -301,13 +279,13 @@ class Manifold:
             f, J = self.call("constraint_rows", x)
             return f[:, 0], J[: len(f)]
 
-        M = self._terms(q, np.zeros(self.dyn.model.nv)).M
+        M = self.terms(q, np.zeros(self.dyn.model.nv))[3]
         return closest_configuration(self.dyn.model, q, M, rows, held)
 
     def restored(self, q: Array, held: Collection[int] = ()) -> Array:
         """Return a configuration with f = 0, by steps that are the least in the mass matrix's metric."""
         x, size, f = self.closest(q, held)
-        if not size <= _HOLDS * (1 + float(np.abs(x).max())):
+        if not size <= CONSISTENT * (1 + float(np.abs(x).max())):
             if not held:
                 refuse_unreachable(self.dyn, q)
             raise InputError(
@@ -315,7 +293,7 @@ class Manifold:
             )
         if still := self.still_open(x):
             raise InputError(
-                f"q: {self.dyn.model.name}: near it the other rows close where these are open: {', '.join(still)}; "
+                f"q: {self.dyn.model.name}: near it the other rows close where these are open: {still}; "
                 "start nearer to a closed configuration"
             )
         return x
@@ -460,7 +438,7 @@ def mobility(dyn: Dynamics, q: Array | None) -> Mobility:
         independent: Collection[int] = equations.row_choice.independent
     else:
         if still := manifold.still_open(q):
-            raise InputError(f"q: {model.name} is open there: {', '.join(still)}; {closed_near(manifold.dyn, q)}")
+            raise InputError(f"q: {model.name} is open there: {still}; {closed_near(manifold.dyn, q)}")
         # The digits that rounding left out of a closed pose tell dependent rows from nearly dependent ones.
         q = manifold.restored(q)
         J, chosen = manifold.all_rows(q), equations.row_choice.independent
@@ -476,15 +454,11 @@ def mobility(dyn: Dynamics, q: Array | None) -> Mobility:
 
 # Independence
 
-#: Configurations near a pose at which J is evaluated too, and how far they are away, rad or m.
-_BESIDE: Final = 4
-_ASIDE: Final = 0.05
-#: Slope of a row, relative to its size beside the pose, where a square is nearly zero.
-_FLAT: Final = 1e-4
+#: Slope of a row, relative to its size beside the pose, below which it is one of a square that is nearly zero: a
+#: consistent state leaves some 20 `CONSISTENT` of it.
+_FLAT: Final = 1e-6
 #: A slope that is rounding alone.
 _ROUNDED: Final = 1e-14
-#: Residual of a consistent configuration, in terms of the rows' sizes.
-_HOLDS: Final = 1e-10
 
 
 def require_few(manifold: Manifold) -> None:
@@ -501,19 +475,44 @@ def require_independent(dyn: Dynamics, q: Array, *, everywhere: bool = False) ->
     """
     manifold = manifold_of(dyn)
     require_few(manifold)
+    around = _around(dyn.model, q)
+    sizes = np.max([np.linalg.norm(manifold.jacobian(x), axis=1) for x in around], axis=0)
+    scale = np.where(sizes > _ROUNDED, sizes, 1.0)[:, None]
+
+    def flat(J: Array) -> NDArray[np.bool_]:
+        return np.asarray((sizes > _ROUNDED) & (np.linalg.norm(J, axis=1) < _FLAT))
+
+    J = manifold.jacobian(q) / scale
+    if not len(_lost(J)) and not flat(J).any():
+        return
+    closed = [manifold.jacobian(x) / scale for x, size, _ in map(manifold.closest, around) if size < CONSISTENT]
+    if not closed:
+        refuse_unreachable(dyn, q)
+    elif len(rows := np.flatnonzero(np.all([flat(x) for x in closed], axis=0))):
+        raise InputError(
+            f"constraints: {_named(rows, manifold)} has no slope where it holds, here and at the poses around, so "
+            "that no force can hold it; write a square as f = 0 instead of f**2 = 0, or start from another pose"
+        )
+    elif len(rows := _lost(best := min(closed, key=lambda x: len(_lost(x))))):
+        others = needed(best, np.setdiff1d(np.arange(len(J)), rows), rows)
+        raise InputError(
+            f"constraints: the set is redundant, here and at poses around; {_named(rows, manifold)} "
+            f"{f'follows from {_named(others, manifold)}' if len(others) else 'holds by itself'}; leave it out, as its "
+            "multiplier is not determined, or start from another pose"
+        )
+    if len(_lost(J)) and not everywhere:
+        raise singular_pose("q", dyn.model.name, manifold.names, J)
+
+
+def _lost(J: Array) -> NDArray[np.intp]:
+    """Return the rows that the others imply."""
+    return np.setdiff1d(np.arange(len(J)), pivoted(J)[0])
+
+
+def _around(model: Model, q: Array) -> list[Array]:
+    """Return a pose, and some beside it."""
     rng = np.random.default_rng(0)
-    beside = [dyn.model.integrate(q, _ASIDE * rng.standard_normal(dyn.model.nv)) for _ in range(_BESIDE)]
-    sizes = np.max([np.linalg.norm(manifold.jacobian(x), axis=1) for x in (q, *beside)], axis=0)
-    scale = np.where(sizes > _ROUNDED, sizes, 1.0)
-    J = manifold.jacobian(q) / scale[:, None]
-    lost, _ = _dependent(J)
-    flat = bool((np.linalg.norm(J, axis=1) < _FLAT)[sizes > _ROUNDED].any())
-    if not len(lost) and not flat:
-        return
-    _explain(manifold, [q, *beside], scale, sizes)
-    if everywhere or not len(lost):
-        return
-    raise singular_pose("q", dyn.model.name, manifold.names, J)
+    return [q, *(model.integrate(q, ASIDE * rng.standard_normal(model.nv)) for _ in range(BESIDE))]
 
 
 def closed_near(dyn: Dynamics, q: Array) -> str:
@@ -531,16 +530,16 @@ def refuse_unreachable(dyn: Dynamics, q: Array | None = None) -> Array:
     least, left = np.inf, np.zeros(states.equations.constraints.positions)
     for start in tried:
         end, size, f = states.closest(start)
-        still = states.still_open(end) if size < _HOLDS else []
-        if size < _HOLDS and not still:
+        still = states.still_open(end) if size < CONSISTENT else ""
+        if size < CONSISTENT and not still:
             require_independent(dyn, end, everywhere=True)
             return end
         if size < least:
             least, left = size, f
-    if least < _HOLDS:
+    if least < CONSISTENT:
         raise InputError(
             f"q: {model.name}: from {len(tried)} starts its loops close only with something open: "
-            f"{', '.join(still) or 'rows that are redundant elsewhere'}; start nearer to a closed configuration"
+            f"{still or 'rows that are redundant elsewhere'}; start nearer to a closed configuration"
         )
     against = np.flatnonzero(np.abs(left) > 1e-6 * np.abs(left).max())
     raise InputError(
@@ -550,41 +549,7 @@ def refuse_unreachable(dyn: Dynamics, q: Array | None = None) -> Array:
     )
 
 
-def _explain(manifold: Manifold, starts: list[Array], scale: Array, sizes: Array) -> None:
-    """Raise why J has dependent rows at and around the first start; return where it has full rank nearby."""
-    consistent = [x for x, size, _ in map(manifold.closest, starts) if size < _HOLDS]
-    if not consistent:
-        refuse_unreachable(manifold.dyn, starts[0])
-        return
-    slopes = [manifold.jacobian(x) / scale[:, None] for x in consistent]
-    flat = np.flatnonzero((np.max([np.linalg.norm(J, axis=1) for J in slopes], axis=0) < _FLAT) & (sizes > _ROUNDED))
-    if len(flat):
-        raise InputError(
-            f"constraints: {_named(flat, manifold)} has no slope where it holds, here and at the poses around, so "
-            "that no force can hold it; write a square as f = 0 instead of f**2 = 0, or start from another pose"
-        )
-    lost, others = min((_dependent(J) for J in slopes), key=lambda pair: len(pair[0]))
-    if len(lost):
-        raise InputError(
-            f"constraints: the set is redundant, here and at poses around; {_named(lost, manifold)} "
-            f"{_reason(others, manifold, 'holds by itself')}; leave it out, as its multiplier is not determined, or "
-            "start from another pose"
-        )
-
-
-def _dependent(J: Array) -> tuple[Array, Array]:
-    """Return the rows that the others imply, and those others that are needed for it."""
-    if len(J) <= J.shape[1] and not dependent(J):
-        # No remainder is smaller than the smallest singular value; this is the quicker answer.
-        return np.empty(0, dtype=int), np.empty(0, dtype=int)
-    order, *_ = pivoted(J)
-    kept, lost = np.array(order, dtype=int), np.setdiff1d(np.arange(len(J)), order)
-    if not len(lost) or not len(kept):
-        return lost, np.empty(0, dtype=int)
-    return lost, needed(J, kept, lost)
-
-
-def needed(J: Array, kept: Array, rows: Sequence[int] | Array) -> Array:
+def needed(J: Array, kept: NDArray[np.intp], rows: Sequence[int] | NDArray[np.intp]) -> NDArray[np.intp]:
     """Return which of the kept rows take part in the combinations of them that are nearest to others."""
     J = unit_rows(J)
     weights = np.linalg.lstsq(J[kept].T, J[rows].T, rcond=None)[0]
@@ -593,7 +558,3 @@ def needed(J: Array, kept: Array, rows: Sequence[int] | Array) -> Array:
 
 def _named(which: Iterable[int], manifold: Manifold) -> str:
     return ", ".join(manifold.names[k] for k in which)
-
-
-def _reason(others: Array, manifold: Manifold, alone: str) -> str:
-    return f"follows from {_named(others, manifold)}" if len(others) else alone

@@ -79,6 +79,7 @@ class SemiImplicitEuler:
 
     name: ClassVar[str] = "semi_implicit_euler"
     stages: ClassVar[int] = 1
+    c: ClassVar[tuple[float, ...]] = (0.0,)
     explicit: ClassVar[bool] = True
     ends_at_a_stage: ClassVar[bool] = False
 
@@ -90,6 +91,11 @@ class SemiImplicitEuler:
         w = w + h * a
         u = h * w
         return space.retract(q, u), w, u
+
+
+#: A singular pose is near where J's rows would depend on each other within so many steps at the present pace. At a
+#: third of the way a series of the tightest tolerance never arrives.
+STEPS_TO_POSE: Final = 4
 
 
 # Errors and lengths of adaptive steps

@@ -36,9 +36,8 @@ def from_consistent(dyn: Dynamics, q: Array, v: Array, t: float) -> tuple[Array,
     poses, rates, why = np.atleast_2d(q), np.atleast_2d(v), ""
     require_independent(manifold.member(0).dyn, poses[0], everywhere=True)
     for k in np.flatnonzero(manifold.at_pose(poses)).tolist():
-        here = Passage(manifold.member(k), t, poses[k], rates[k])
-        if here.undetermined:
-            why = f"q0: {dyn.model.name} is {here.undetermined}; give another velocity, or start beside it"
+        if here := Passage(manifold.member(k), t, poses[k]).undetermined(rates[k]):
+            why = f"q0: {dyn.model.name} is {here}; give another velocity, or start beside it"
     # One of a batch does not stop the others.
     if why and q.ndim == 1:
         raise NumericalError(why)

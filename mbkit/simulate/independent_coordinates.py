@@ -72,7 +72,7 @@ def _run(system: Embedded, problem: IntegrationProblem, solver: Callable[[Dynami
     else:
         steps = GridRecord(problem)
         run = SteppedRun(problem, _ChartStepper(charts, problem.method, steps), problem.v0.copy(), steps)
-        charts.passed.began(problem.start, problem.q0)
+        charts.passed.saw(problem.start, problem.q0)
         run.to_end()
         steps.poses = {0: charts.passed}
         result = steps.result(lambda _: run.why)

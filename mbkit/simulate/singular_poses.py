@@ -10,16 +10,15 @@ vanish do so at a rate. At rest they do not, and no equation says which branch c
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from functools import cached_property
-from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import CONSISTENT, EPS, Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import MAX_NAMES, at_times
-from mbkit.engines.constrained import AT_SINGULAR_POSE, TAKES_PART
+from mbkit.engines.constrained import AT_POSE, AT_SINGULAR_POSE, TAKES_PART
+from mbkit.methods.one_step import STEPS_TO_POSE
 from mbkit.model.validation import listing
 
 if TYPE_CHECKING:
@@ -28,17 +27,13 @@ if TYPE_CHECKING:
 #: Tightest tolerance of states within a step near a singular pose: f, whose rounding is never zero, is divided by the
 #: distance from the pose. The end of the step is closer.
 LOOSEST: Final = 1e-10
-#: Steps within which a pose is near. At a third of the way a series of the tightest tolerance never arrives.
-AHEAD: Final = 4
-#: Ends of steps that decide on one of them, and the parts of it at which it is looked at too.
-_WINDOW: Final = 4
-_WITHIN: Final = (0.25, 0.5, 0.75)
-#: Largest velocity residual, relative to the rows (1/s), that counts as zero.
-_STILL: Final = 1e-7
+#: Ends of steps that are looked at together.
+_ENDS: Final = 256
 #: Rest of γ at a velocity that stays on a branch to a loose run's digits, relative to its size at any velocity.
 _ON_BRANCH: Final = 1e-5
-#: Difference of times by which J's rate is found, relative to the motion's time scale.
-_APART: Final = 1e-4
+#: Difference of times by which J's rate is found, relative to the motion's time scale: there truncation and rounding
+#: are alike.
+_APART: Final = EPS ** (1 / 3)
 
 
 def manifold_at(dyn: Dynamics, t: float) -> Manifold:
@@ -56,34 +51,30 @@ def _known(dyn: Dynamics, t: float) -> float:
 
 
 class Passage:
-    """A motion at a singular pose: by which rows it is one, and why it is not determined there."""
+    """A singular pose: which rows depend on each other there, and why a motion through it is not determined."""
 
-    def __init__(self, manifold: Manifold, t: float, q: Array, v: Array) -> None:
-        from mbkit.engines.constraint_manifold import AT_POSE
-
-        self._manifold, self._t, self._q, self._v = manifold, t, q, v
+    def __init__(self, manifold: Manifold, t: float, q: Array) -> None:
+        self._manifold, self._t, self._q = manifold, t, q
         U, sizes, Vt = np.linalg.svd(manifold.jacobian(q))
         rank = min(int(np.count_nonzero(sizes > AT_POSE * sizes[0])), len(U) - 1)
         # Rows that are all zero have no size of their own.
         self._lost, self._free = U[:, rank:] / (float(sizes[0]) or 1.0), Vt[rank:].T
 
     @property
-    def rows(self) -> list[int]:
-        """Which rows depend on each other."""
+    def rows(self) -> list[str]:
+        """Names of the rows that depend on each other."""
         part = np.abs(self._lost).max(axis=1)
-        return [int(k) for k in np.flatnonzero(part > TAKES_PART * np.linalg.norm(self._lost[:, 0]))]
+        which = np.flatnonzero(part > TAKES_PART * np.linalg.norm(self._lost[:, 0]))
+        return [self._manifold.names[k] for k in which]
 
-    @cached_property
-    def undetermined(self) -> str:
-        """Where the motion is, and why it does not go on in one way; empty where it does."""
-        why = self._undetermined()
-        if not why:
-            return ""
-        rows = listing([self._manifold.names[k] for k in self.rows], MAX_NAMES)
-        return f"{AT_SINGULAR_POSE}, where {rows} depend on each other, and {why}"
+    def undetermined(self, v: Array) -> str:
+        """Return where a motion with this velocity is, and why it does not go on in one way; empty where it does."""
+        why = self._why(v)
+        rows = listing(self.rows, MAX_NAMES)
+        return f"{AT_SINGULAR_POSE}, where {rows} depend on each other, and {why}" if why else ""
 
-    def _undetermined(self) -> str:
-        manifold, q, v = self._manifold, self._q, self._v
+    def _why(self, v: Array) -> str:
+        manifold, q = self._manifold, self._q
         speed, dyn = float(np.abs(v).max()), manifold.dyn
         if not speed:
             return "at rest there each branch of its motion is as good as another"
@@ -91,8 +82,8 @@ class Passage:
             manifold.at(_known(dyn, self._t + side)).jacobian(dyn.model.integrate(q, side * v))
             for side in (_APART / speed, -_APART / speed)
         )
-        turning = self._lost.T @ (J1 - J0) @ self._free * (speed / (2 * _APART))
-        if not np.linalg.svd(turning, compute_uv=False)[-1] > _STILL:
+        turning = self._lost.T @ (J1 - J0) @ self._free / (2 * _APART)
+        if not np.linalg.svd(turning, compute_uv=False)[-1] > CONSISTENT:
             return "its velocity does not say on which branch it goes on"
         # γ is quadratic in v, and zero in these rows on a branch. Differences of any length are its derivative.
         around = speed * np.eye(len(v))
@@ -108,7 +99,7 @@ class Passage:
 def undetermined(dyn: Dynamics, t: float, q: Array, v: Array) -> str:
     """Return why the motion of one state at a singular pose does not go on in one way; empty where it does."""
     (q,), (v,) = np.atleast_2d(q), np.atleast_2d(v)
-    return Passage(manifold_at(dyn, t).member(0), t, q, v).undetermined
+    return Passage(manifold_at(dyn, t).member(0), t, q).undetermined(v)
 
 
 class Approach:
@@ -140,17 +131,15 @@ class Approach:
     def crosses(self, h: float) -> bool:
         """Return whether a pose is within a few steps of length h, ahead or behind; then it is `near`."""
         # A pace that is not known is not above.
-        self.near = not (self._distance > AHEAD * h * self._pace).all()
+        self.near = not (self._distance > STEPS_TO_POSE * h * self._pace).all()
         if self.near and self._unseen is not None:
             self.ahead, self._unseen = time_ahead(*self._unseen), None
-        self.near = self.near and bool((np.abs(self.ahead) <= AHEAD * h).any())
+        self.near = self.near and bool((np.abs(self.ahead) <= STEPS_TO_POSE * h).any())
         return self.near
 
 
 def time_ahead(dyn: Dynamics, t: float, q: Array, v: Array) -> Array:
     """Return when J's smallest singular value will be zero at its present rate, s from now; 0 at a singular pose."""
-    from mbkit.engines.constraint_manifold import AT_POSE
-
     manifold = manifold_at(dyn, t)
     apart = _APART / np.maximum(np.abs(v).max(axis=-1, keepdims=True), np.finfo(float).tiny)
     J, beside = (manifold.jacobian(x) for x in (q, dyn.model.integrate(q, apart * v)))
@@ -162,137 +151,99 @@ def time_ahead(dyn: Dynamics, t: float, q: Array, v: Array) -> Array:
 
 
 class SingularPoses:
-    """The singular poses that one trajectory passes, by how far from one it is at and between the ends of its steps.
+    """The singular poses that one trajectory passes, by the ends of its steps.
 
-    Through a singular pose this distance, 1/√`dependence`, is smooth once its sign is changed there.
+    From one end to the next the rows of J turn little, but through a singular pose each combination of them that
+    vanishes there comes back the other way round: of the orthonormal rows B = (J Jᵀ)^-½ J at both ends, B1 B0ᵀ is near
+    1, but for -1 on these combinations.
     """
 
     def __init__(self, dyn: Dynamics) -> None:
-        self._dyn = dyn
-        self._seen: list[tuple[float, float, Array]] = []
-        self._times: list[float] = []
-        self._rows: list[int] = []
+        self._dyn, self._times, self.rows = dyn, list[float](), list[str]()
+        # Ends of steps; those before `_new` are looked at already.
+        self._t, self._q, self._new = np.empty(0), np.empty((0, dyn.model.nq)), 1
 
-    def began(self, t: float, q: Array) -> None:
-        """Take in the start."""
-        self.saw(t, q)
-        self._at_end()
+    def saw(self, t: float | Array, q: Array) -> None:
+        """Take in the start, then the ends of one step or more, (n,) and (n, nq)."""
+        self._t, self._q = np.append(self._t, t), np.concatenate([self._q, np.atleast_2d(q)])
+        if len(self._t) >= _ENDS:
+            self._look(last=False)
 
     @property
     def times(self) -> list[float]:
         """The times of the poses, up to the last state that was taken in."""
-        # No step follows the last one.
-        self._decide(len(self._seen) - 1)
-        self._at_end()
+        self._look(last=True)
         return self._times
 
-    def _at_end(self) -> None:
-        """Keep a pose at which the last state is."""
-        for t, _, q in self._seen[-1:]:
-            if manifold_at(self._dyn, t).at_pose(q) and self._new_since(t):
-                self._passed(t, t, q)
-
-    def _new_since(self, t: float) -> bool:
-        return not self._times or self._times[-1] < t
-
-    def _passed(self, t: float, near: float, q: Array) -> None:
-        """Keep the time of a pose, and the rows that depend on each other at the state nearest to it."""
-        manifold = manifold_at(self._dyn, near)
-        self._rows = Passage(manifold, near, q, np.zeros(manifold.dyn.model.nv)).rows
-        self._times.append(t)
-
-    def saw(self, t: float, q: Array) -> None:
-        """Take in the end of a step."""
-        self.take(t, float(manifold_at(self._dyn, t).dependence(q)), q)
-
-    def saw_all(self, t: Array, q: Array) -> None:
-        """Take in the ends of steps, (n,) and (n, nq)."""
+    def _look(self, *, last: bool) -> None:
+        """Look for poses in the steps that are kept, in the last one too where no other follows."""
         from mbkit.engines.constraint_manifold import manifold_of
 
-        depends = manifold_of(at_times(manifold_of(self._dyn).dyn, t, 1)).dependence(q)
-        for end in zip(t.tolist(), depends.tolist(), q, strict=True):
-            self.take(*end)
+        dyn = manifold_of(self._dyn).dyn
+        # Through a pose this distance from it is smooth once its sign is changed there. In it rounding has any sign.
+        far = np.abs(manifold_of(at_times(dyn, self._t, 1)).dependence(self._q)) ** -0.5
+        # A state that is not finite says nothing, nor one a second time.
+        good = np.isfinite(far) & (np.diff(self._t, prepend=-np.inf) > 0)
+        t, q, far = self._t[good], self._q[good], far[good]
+        pace = np.pad(np.abs(np.diff(far)) / np.diff(t), 1, constant_values=np.inf)
+        reach = STEPS_TO_POSE * np.diff(t) * np.max([pace[:-2], pace[1:-1], pace[2:]], axis=0)
+        end = len(t) - (not last)
+        for k in range(self._new, end):
+            if far[k - 1] + far[k] <= 2 * reach[k - 1]:
+                self._look_in(t, q, far, k)
+        kept = max(end - 2, 0)
+        self._t, self._q, self._new = t[kept:], q[kept:], max(end - kept, 1)
 
-    def take(self, t: float, dependence: float, q: Array) -> None:
-        """Take in the end of a step by the `dependence` of rows there; one that is not positive says nothing."""
-        if dependence > 0 and all(t > before for before, *_ in self._seen[-1:]):
-            self._seen = [*self._seen[1 - _WINDOW :], (t, dependence**-0.5, q)]
-            # The step before is known to both sides.
-            self._decide(len(self._seen) - 2)
-
-    def _decide(self, k: int) -> None:
-        """Look for a pose in the step that ends at the state k of those that are kept."""
-        seen = self._seen
-        if k < 1 or (k > 1 and seen[k - 1][1] > seen[k - 2][1]) or (k + 1 < len(seen) and seen[k][1] > seen[k + 1][1]):
-            return
-        if not self._new_since(seen[max(k - 2, 0)][0]):
-            return
-        t, s, q = (list(x) for x in zip(*seen, strict=True))
-        passed = [*s[:k], *(-x for x in s[k:])]
-        if 1 < k < len(s) - 1 and not _bend(t, passed) < _bend(t, s):
-            # Ends on both sides tell that none is here, and cost no evaluation.
-            return
-        model, h = self._dyn.model, t[k] - t[k - 1]
-        way = model.difference(q[k - 1], q[k])
-        inner = [t[k - 1] + part * h for part in _WITHIN]
-        places = [model.integrate(q[k - 1], part * way) for part in _WITHIN]
-        depends = [float(manifold_at(self._dyn, x).dependence(y)) for x, y in zip(inner, places, strict=True)]
-        times, sizes = [*t[:k], *inner, *t[k:]], np.array([*s[:k], *np.power(depends, -0.5), *s[k:]])
-        turned = (
-            _bend(times, np.where(np.arange(len(sizes)) < i, sizes, -sizes)) for i in range(k, k + len(inner) + 1)
-        )
-        if min(turned) < _bend(times, sizes):
-            roots = np.roots(np.polyfit(np.array(t) - t[k - 1], passed, len(s) - 1))
-            within = roots[np.isreal(roots) & (roots.real >= 0) & (roots.real <= h)].real
-            nearest = k - 1 if s[k - 1] < s[k] else k
-            self._passed(t[k - 1] + float(within[0]) if len(within) else t[nearest], t[nearest], q[nearest])
-
-    def describe(self, tolerance: bool) -> str:
-        """Return the poses in a sentence, for a method with or without a tolerance; empty where there are none."""
-        if not (times := self.times):
-            return ""
-        when = ", ".join(f"{t:.4g}" for t in times[:3]) + (" and later" if len(times) > 3 else "")
-        names = manifold_at(self._dyn, times[0]).names
-        rows = " and ".join(names[k] for k in self._rows)
-        error = f"; a step there may be off by {LOOSEST:g} whatever the tolerance" if tolerance else ""
-        return (
-            f"passed a singular pose at t = {when} (s), where {rows} lose their independence; other motions may begin "
-            f"there, and the run followed the smooth one{error}"
-        )
+    def _look_in(self, t: Array, q: Array, far: Array, k: int) -> None:
+        """Look for a pose in the step that ends at the k-th state."""
+        nearest, rows = k - 1 if far[k - 1] < far[k] else k, []
+        for i in (k - 1, k):
+            U, sizes, Vt = np.linalg.svd(manifold_at(self._dyn, t[i]).jacobian(q[i]), full_matrices=False)
+            rows.append(U @ Vt)
+            if sizes[-1] <= AT_POSE * sizes[0]:
+                when = t[i]
+                break
+        else:
+            turn = rows[1] @ rows[0].T
+            if not np.linalg.eigvalsh(turn + turn.T)[0] < 0:
+                return
+            near = slice(max(k - 2, 0), k + 2)
+            ends = t[near] - t[k - 1]
+            roots = np.roots(np.polyfit(ends, np.where(ends > 0, -far[near], far[near]), len(ends) - 1))
+            within = roots[np.isreal(roots) & (roots.real >= 0) & (roots.real <= t[k] - t[k - 1])].real
+            when = t[k - 1] + float(within[0]) if len(within) else t[nearest]
+        if not self._times or self._times[-1] < when:
+            self.rows = Passage(manifold_at(self._dyn, t[nearest]), t[nearest], q[nearest]).rows
+            self._times.append(float(when))
 
 
 class SingularPosesOfBatch:
-    """The singular poses that trajectories pass which step together, by their numbers."""
+    """The singular poses that trajectories pass which step together, by their numbers; none where nothing is held."""
 
     def __init__(self, dyn: Dynamics, t: float, q: Array, members: Iterable[int] | None = None) -> None:
         which = range(len(q)) if members is None else members
-        self.members = {i: SingularPoses(dyn._of_samples([i])) for i in which}
-        for i, poses in self.members.items():
-            poses.began(t, q[i])
+        self.members = {int(i): SingularPoses(dyn._of_samples([i])) for i in which if dyn._projects}
+        self.saw(t, q[list(self.members)], self.members)
 
-    def saw(self, dyn: Dynamics, t: float, q: Array, members: Iterable[int]) -> None:
-        """Take in the ends of the steps of these members, whose dynamics are `dyn`."""
-        for i, depends, at in zip(members, manifold_at(dyn, t).dependence(q).tolist(), q, strict=True):
-            self.members[int(i)].take(t, depends, at)
+    def saw(self, t: float, q: Array, members: Iterable[int]) -> None:
+        """Take in the ends of the steps of these members, (nq,) or (n, nq)."""
+        for i, at in zip(members, np.atleast_2d(q), strict=True) if self.members else ():
+            self.members[int(i)].saw(t, at)
 
 
-def describe_poses(members: Mapping[int, SingularPoses], batch: int | None, tolerance: bool) -> str:
+def describe_poses(poses: Mapping[int, SingularPoses], batch: int | None, tolerance: bool) -> str:
     """Return the poses that one trajectory, or some of a batch, passed in a sentence; empty where there are none.
 
     Its method has a tolerance, or a step.
     """
-    passed = {i: poses for i, poses in members.items() if poses.times}
+    passed = {i: times for i, x in poses.items() if (times := x.times)}
     if not passed:
         return ""
-    first, poses = min(passed.items())
-    if batch is None:
-        return poses.describe(tolerance)
+    first, times = min(passed.items())
+    of = "" if batch is None else f"{len(passed)} of {batch} trajectories passed singular poses; trajectory {first} "
+    when = ", ".join(f"{t:.4g}" for t in times[:3]) + (" and later" if len(times) > 3 else "")
+    error = f"; a step there may be off by {LOOSEST:g} whatever the tolerance" if tolerance else ""
     return (
-        f"{len(passed)} of {batch} trajectories passed singular poses; trajectory {first} {poses.describe(tolerance)}"
+        f"{of}passed a singular pose at t = {when} (s), where {' and '.join(poses[first].rows)} lose their "
+        f"independence; other motions may begin there, and the run followed the smooth one{error}"
     )
-
-
-def _bend(t: Iterable[float], x: Iterable[float]) -> float:
-    """Return how much the slope of a line through points changes, in all."""
-    slopes = [(x1 - x0) / (t1 - t0) for (t0, t1), (x0, x1) in zip(pairwise(t), pairwise(x), strict=True)]
-    return sum(abs(b - a) for a, b in pairwise(slopes))

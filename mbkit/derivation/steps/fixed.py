@@ -23,7 +23,7 @@ from typing import Any, Final
 import casadi as ca
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import ROUNDING, Array
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, quick_projection, thorough_projection
 from mbkit.derivation.steps.symbols import SymbolicSpace
@@ -36,8 +36,6 @@ _MARCHED: Final = ("q1", "w1", "squares1")
 #: Number of operations of all stages above which the forward dynamics is compiled once and called for each of them:
 #: LLVM's time grows faster than the step, which then runs no faster than its parts.
 _MAX_OPERATIONS_IN_ONE_PIECE: Final = 20_000
-#: Fewest stages of a method that has one within the step, from which a pose is seen that both ends are as far from.
-_MIN_STAGES_WITH_INNER: Final = 3
 #: The numbers of a state feedback.
 LAW: Final = "law"
 #: Names that a march hands on from step to step.
@@ -208,7 +206,8 @@ def march_in_stages(equations: Equations, method: str, *, thorough: bool = False
         behind, v1 = at_time(equations, s["dt"]).values(), space.to_body_velocity(q1, w1)
         if not formula.ends_at_a_stage:
             dependences.append(dependence(equations)(q1, *behind))
-        if formula.stages < _MIN_STAGES_WITH_INNER:
+        if not any(0 < c < 1 - ROUNDING for c in formula.c):
+            # A pose may lie between that both ends are as far from.
             middle = space.retract(s["q"], 0.5 * s["dt"] * w1), *at_time(equations, 0.5 * s["dt"]).values()
             dependences.append(dependence(equations)(*middle))
         if thorough or not formula.ends_at_a_stage:

@@ -25,10 +25,9 @@ import numpy as np
 from mbkit.derivation.equations import kept
 from mbkit.derivation.mass_matrix_solve import ConstraintTerms
 from mbkit.derivation.steps.symbols import SymbolicSpace
+from mbkit.methods.one_step import STEPS_TO_POSE
 from mbkit.model.manifold import random_state
 
-#: A pose is singular ahead where J's rows would depend on each other within so many steps at the present pace.
-_STEPS_AHEAD: Final = 4
 #: Number of iterations of the thorough projection.
 _ITERATIONS: Final = 4
 #: Largest error that an iteration may leave, relative to coordinates and velocities, if rows bend as much as they
@@ -163,6 +162,7 @@ def nears_singular(before: Any, *behind: Any) -> Any:
     It is known at the start, and behind it at the end and between: the ends may be as far from a pose in the middle.
     With r = 1/√dependence, as far from such a pose: r1 < n abs(r1 - r0), or r1 > n/(n - 1) r0, or r1 < n/(n + 1) r0.
     """
-    nearer, farther = (_STEPS_AHEAD + 1) ** 2 / _STEPS_AHEAD**2, (_STEPS_AHEAD - 1) ** 2 / _STEPS_AHEAD**2
+    n = STEPS_TO_POSE
+    nearer, farther = (n + 1) ** 2 / n**2, (n - 1) ** 2 / n**2
     # A sum, which NumPy and CasADi both know.
     return sum((x > nearer * before) + (x < farther * before) for x in behind) > 0

@@ -19,7 +19,6 @@ from mbkit.model.manifold import least_change, random_state
 #: Random states that are drawn, each of which may be too far from the constraints, and how many of them anywhere.
 _DRAWS: Final = 50
 _ANYWHERE: Final = 10
-_NEARER: Final = 0.9
 #: Steps of half of Newton's length, then whole ones, from a random state onto the constraints.
 _HALF, _WHOLE = 12, 8
 #: How far beside the start a second flow begins, and how much farther apart the two may come; so much larger the
@@ -65,7 +64,7 @@ class ConsistentStates:
             if k >= _ANYWHERE:
                 # Of many loops few configurations are near a closed one: nearer and nearer to one that is known.
                 model, known = dyn.model, dyn.model.neutral() if closed is None else closed
-                q = model.integrate(known, _NEARER ** (k - _ANYWHERE) * model.difference(known, q))
+                q = model.integrate(known, (_DRAWS - k) / (_DRAWS - _ANYWHERE) * model.difference(known, q))
             # On some branches constraints depend on each other, and where a disc lies flat M may have no inverse.
             with suppress(InputError, NumericalError):
                 state = flowed(self.manifold, q, v, well)
@@ -125,7 +124,7 @@ def flowed(manifold: Manifold, q: Array, v: Array, well: float) -> tuple[Array, 
     v1 = v
     # Once more for what rounding leaves, as a velocity may be small beside the one that was drawn.
     for _ in range(2):
-        x = manifold._terms(q, v1)
-        v1 = v1 + least_change(x.M, x.J, -x.rate)
+        _, J, rate, M = manifold.terms(q, v1)
+        v1 = v1 + least_change(M, J, -rate)
     good = np.linalg.norm(v1) <= _SLOPE * np.linalg.norm(v) and not manifold.still_open(q, v1)
     return (q, v1) if good else None

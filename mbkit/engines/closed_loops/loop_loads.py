@@ -11,7 +11,7 @@ one with the least norm over all rows.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -25,7 +25,7 @@ from mbkit.errors import InputError
 from mbkit.model import Frame, Joint, Model
 from mbkit.model.description import frame_of
 from mbkit.model.elements.paths import Path
-from mbkit.model.loops import LOOP_KINDS, LOOP_ROWS, LoopEnds
+from mbkit.model.loops import LOOP_KINDS, LOOP_ROWS
 from mbkit.model.parts import Loop
 
 LOOP_LOADS: Final = Path(
@@ -170,15 +170,9 @@ class LoopLoads(Actuation, Loads):
         """Return the loads of joints and loops of a motion with multipliers of all rows."""
         on = [*frames]
         acting = [] if wrenches is None else self._about_world(q, wrenches.reshape(-1, 6), frames, axes)
-        own, first = [], 0
-        for k, loop in enumerate(self.model.loops):
-            last = first + len(LOOP_ROWS[loop.kind][0])
-            ends = _frames_of(loop, k, self.model)
-            (X_a, X_b, X_c) = self._pose(q, ends)
-            force, moment = _wrench(loop, X_a, X_b, X_c, shares[first:last])
-            first = last
-            own.append(np.concatenate([X_a[:3, :3].T @ x for x in (force, moment)]))
-            pulling = np.concatenate([force, moment + np.cross(X_a[:3, 3], force)])
+        own = []
+        for ends, load, pulling in self._of_loops(lambda x: self._pose(q, x), shares):
+            own.append(load)
             for frame, wrench in ((ends[0], pulling), (ends[1], -pulling)):
                 if frame.body != "world":
                     on.append(frame)
@@ -186,6 +180,28 @@ class LoopLoads(Actuation, Loads):
         given = [np.concatenate(acting)] if acting else []
         loads = self._joint_wrenches(q, v, a, *given, joints, tuple(on), WORLD)
         return np.vstack([np.reshape(loads, (-1, 6)), np.reshape(own, (-1, 6))])
+
+    def _of_loops(
+        self, pose: Callable[[tuple[Frame, ...]], Iterable[Array]], shares: Array
+    ) -> Iterator[tuple[tuple[Frame, ...], Array, Array]]:
+        """Yield the frames of each loop, and its wrench on body a in the axes of frame a and about the world's origin.
+
+        It is that of the virtual work of its rows as end a moves.
+        """
+        # The import loads CasADi, which trees never need here.
+        from mbkit.engines.closed_loops.frame_rows import MovingFrame, loop_rows
+
+        first, still = 0, np.zeros(6)
+        for k, loop in enumerate(self.model.loops):
+            frames = _frames_of(loop, k, self.model)
+            moves = (np.eye(6), np.zeros((6, 6)), np.zeros((6, 6)))
+            a, *others = (
+                MovingFrame(X[:3, :3], X[:3, 3], J, still, still) for X, J in zip(pose(frames), moves, strict=True)
+            )
+            J = loop_rows(loop, a, *others).J
+            first, (force, moment) = first + len(J), np.split(J.T @ shares[first : first + len(J)], 2)
+            own = np.concatenate([a.R.T @ force, a.R.T @ moment])
+            yield frames, own, np.concatenate([force, moment + np.cross(a.p, force)])
 
     def _about_world(self, q: Array, wrenches: Array, frames: tuple[Frame, ...], axes: str) -> list[Array]:
         """Return wrenches on frames about the world's origin, in its axes."""
@@ -251,18 +267,13 @@ class LoopLoads(Actuation, Loads):
 
     def _strained(self, X: dict[str, Array], shares: Array) -> Iterator[Array]:
         """Yield what forces in the loops, in balance with each other, add to the load of each joint and loop."""
-        model, own, first = self.model, [], 0
+        model, own = self.model, []
         #: Wrench of all that a body carries, about the world's origin.
         total = {name: np.zeros(6) for name in X}
-        for k, loop in enumerate(model.loops):
-            last = first + len(LOOP_ROWS[loop.kind][0])
-            X_a, X_b, X_c = (X[f.body] @ frame_of(f) for f in _frames_of(loop, k, model))
-            force, moment = _wrench(loop, X_a, X_b, X_c, shares[first:last])
-            first = last
-            own.append(np.concatenate([X_a[:3, :3].T @ x for x in (force, moment)]))
-            pulling = np.concatenate([force, moment + np.cross(X_a[:3, 3], force)])
-            total[loop.body_a] += pulling
-            total[loop.body_b] -= pulling
+        for (a, b, _), load, pulling in self._of_loops(lambda x: [X[f.body] @ frame_of(f) for f in x], shares):
+            own.append(load)
+            total[a.body] += pulling
+            total[b.body] -= pulling
         for joint in reversed(model.tree):
             total[joint.parent] += total[joint.child]
         for joint in self._joints(None):
@@ -278,18 +289,3 @@ def _frames_of(loop: Loop, k: int, model: Model) -> tuple[Frame, Frame, Frame]:
         Frame(f"\0loop{k}.b", loop.body_b, loop.rotation_b, loop.translation_b),
         Frame(f"\0loop{k}.c", model.carrier(loop), np.eye(3), np.zeros(3)),
     )
-
-
-def _wrench(loop: Loop, X_a: Array, X_b: Array, X_c: Array, shares: Array) -> tuple[Array, Array]:
-    """Return force and moment on body a about the origin of its frame, in world axes, by virtual work of the rows."""
-    R = X_c[:3, :3]
-    gap = R.T @ (X_a[:3, 3] - X_b[:3, 3])
-    A, B = R.T @ X_a[:3, :3], R.T @ X_b[:3, :3]
-    rows = LOOP_ROWS[loop.kind][1]
-    out = np.empty(6)
-    for i, unit in enumerate(np.eye(3)):
-        for k, (shift, turned) in enumerate(((unit, 0.0 * A), (0.0 * unit, np.cross(unit, A, axisb=0).T))):
-            # Rows are polynomials of the second degree: the imaginary part is the derivative itself.
-            ends = LoopEnds(list(gap + 1e-30j * shift), list((A + 1e-30j * turned).T), list(B.T), loop.length)
-            out[i + 3 * k] = shares @ np.imag(rows(ends)) * 1e30
-    return R @ out[:3], R @ out[3:]

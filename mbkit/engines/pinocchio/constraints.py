@@ -241,8 +241,7 @@ class PinConstraints:
                 v_b, y = place.act(v_b), place.act(y)
                 x, y = (x + v_a.cross(v_b)).vector, y.vector
             (*x,), (*y,) = x.tolist(), y.tolist()
-            size = max(map(abs, (*x, *y)))
-            if not max(abs(s - t) for s, t in zip(x, y, strict=True)) <= ITERATED * max(size, 1e-3):
+            if not max(abs(s - t) for s, t in zip(x, y, strict=True)) <= ITERATED * max(map(abs, (*x, *y))):
                 return False
         return True
 

@@ -71,9 +71,7 @@ class _FieldStepper(Stepper):
     """Steps of a method that only evaluates ẇ; it looks for singular poses of constraints on the way."""
 
     def __init__(self, problem: IntegrationProblem) -> None:
-        self.poses: SingularPosesOfBatch | None = None
-        if problem.dyn._projects:
-            self.poses = SingularPosesOfBatch(problem.dyn, problem.start, problem.q)
+        self.poses = SingularPosesOfBatch(problem.dyn, problem.start, problem.q)
         self._members: Indices = np.arange(len(problem.q))
         self.space = Space(problem.dyn.model)
         self.field = Field(problem.dyn, self.space)
@@ -88,8 +86,7 @@ class _FieldStepper(Stepper):
 
     def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
         q, w = self.field.settled(t, q, w)
-        if self.poses is not None:
-            self.poses.saw(self.field.dyn, t, np.atleast_2d(q), self._members)
+        self.poses.saw(t, q, self._members)
         return q, w
 
     def to_body_velocity(self, q: Array, w: Array) -> Array:
@@ -130,8 +127,7 @@ def run_fixed(
     run = SteppedRun(problem, stepper, stepper.space.to_integrator_velocity(problem.q0, problem.v0), record, members)
     run.to_end()
     run.record.evaluations = stepper.field.evaluations
-    if stepper.poses is not None:
-        run.record.poses = stepper.poses.members
+    run.record.poses = stepper.poses.members
     return run.record.result(lambda _: run.why)
 
 

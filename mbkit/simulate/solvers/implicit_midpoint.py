@@ -64,7 +64,9 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
             def velocity(t: float, q: Array, pi: Array, members: Indices) -> Array:
                 return _velocities(dyn, midpoint, members, t, q, pi)
 
-            record, iterations, lost = run_implicit(problem, midpoint, pi0, w0, velocity)
+            poses = SingularPosesOfBatch(dyn, problem.start, problem.q)
+            record, iterations, lost = run_implicit(problem, midpoint, pi0, w0, velocity, poses)
+            record.poses = poses.members
             # A step from or to a singular pose is one of Python, and so are all others of its trajectory.
             members: Indices | None = np.array(sorted(lost) if dyn._projects else [], dtype=np.intp)
 
@@ -74,10 +76,11 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
         else:
             record, members = GridRecord(problem), None
         if members is None or len(members):
-            stepper = MidpointStepper(dyn, problem, w0)
+            stepper = MidpointStepper(dyn, problem, w0, members)
             run = SteppedRun(problem, stepper, pi0[0] if problem.batch is None else pi0, record, members)
             run.to_end()
             iterations += stepper.iterations
+            record.poses = {**record.poses, **stepper.poses.members}
 
             def why(i: int) -> str:  # noqa: ARG001  # of a batch the first one's
                 return run.why
@@ -85,11 +88,6 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
         _to_velocities(dyn, midpoint, problem, record)
     # Each iteration is an evaluation, and so is the end of each step.
     record.evaluations, record.jacobians = iterations + int(record.good.sum()), iterations
-    if dyn._projects and len(record.kept) > problem.grid.steps:
-        # Only where all steps are kept.
-        times, record.poses = problem.grid.times, SingularPosesOfBatch(dyn, problem.start, problem.q).members
-        for i, last in enumerate(record.good.tolist()):
-            record.poses[i].saw_all(times[1 : last + 1], record.q[i, 1 : last + 1])
     return record.result(why)
 
 
@@ -142,10 +140,13 @@ def _reason(q: Array, pi: Array) -> str:
 class MidpointStepper(Stepper):
     """Newton's iteration for trajectories side by side, one step at a time; `iterations` are of all together."""
 
-    def __init__(self, dyn: LagrangianDynamics, problem: IntegrationProblem, w0: Array) -> None:
+    def __init__(
+        self, dyn: LagrangianDynamics, problem: IntegrationProblem, w0: Array, members: Indices | None
+    ) -> None:
         self._dyn, self._midpoint, self._space = dyn, midpoint_of(dyn), Space(dyn.model)
         self._single = problem.batch is None
         self._members: Indices = np.arange(len(w0))
+        self.poses = SingularPosesOfBatch(dyn, problem.start, problem.q, members)
         # The velocities of the last steps, and the first guess of the next one.
         self._last, self._guess = [w0] * len(GUESS_WEIGHTS), w0
         self.iterations, self._why = 0, ""
@@ -154,6 +155,10 @@ class MidpointStepper(Stepper):
         which = members if good is None else good
         self._members = members
         self._last, self._guess = [w[which] for w in self._last], self._guess[which]
+
+    def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
+        self.poses.saw(t, q, self._members)
+        return q, w
 
     def velocity(self, t: float, q: Array, w: Array) -> Array:
         both = np.atleast_2d(q), np.atleast_2d(w)

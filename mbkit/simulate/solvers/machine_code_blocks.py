@@ -33,6 +33,7 @@ from mbkit.methods.tableaus import ImplicitTableau
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.run_data import SolverResult
+from mbkit.simulate.singular_poses import SingularPosesOfBatch
 from mbkit.simulate.solvers.fixed_step import run_fixed, to_body_velocity
 from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.time_grid import Grid, Indices
@@ -454,12 +455,13 @@ def run_implicit(
     other: Array,
     guess: Array,
     velocity: Callable[[float, Array, Array, Indices], Array],
+    poses: SingularPosesOfBatch | None = None,
 ) -> tuple[GridRecord, int, dict[int, list[Array]]]:
     """Run every trajectory, some side by side, and such chunks at once on several cores.
 
     `other` is what goes with q, (n, nv), and `guess` the first unknown; velocity(t, q, other, members) is mbkit's.
     Returns also Newton's iterations, and the last state of each trajectory that was lost, by its index. The record
-    holds `other` in the place of v.
+    holds `other` in the place of v. `poses` take in the end of each step.
     """
     dyn, record, grid = problem.dyn, GridRecord(problem), problem.grid
     assert isinstance(dyn, LagrangianDynamics)
@@ -473,9 +475,16 @@ def run_implicit(
         chunk.begin(*(x[members] for x in own), *([] if values.ndim == 2 else [values]))
         return chunk
 
+    def after_block(chunk: ImplicitChunk, members: Indices, k: int, last: dict[int, list[Array]]) -> None:
+        lost.update(last)
+        if poses is not None and poses.members:
+            times, q = grid.times_of(np.arange(k - chunk.taken, k) + 1), chunk.states("q", np.arange(chunk.taken) + 1)
+            for i, good, at in zip(members.tolist(), chunk.good.tolist(), q, strict=True):
+                poses.members[i].saw(times[:good], at[:good])
+
     run_members(
         *(problem, record, np.arange(len(other)), WIDEST, workers, lambda _: begin, velocity),
-        after_block=lambda _chunk, _members, _k, last: lost.update(last),
+        after_block=after_block,
         after_part=lambda chunk, _part: iterations.append(chunk.iterations),
     )
     return record, sum(iterations), lost

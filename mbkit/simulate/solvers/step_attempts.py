@@ -17,6 +17,7 @@ from mbkit.methods.one_step import (
     FIRST_ROOT,
     MAX_GROWTH,
     SCALARS,
+    STEPS_TO_POSE,
     ArrayStages,
     elementary_factors,
     embedded_error,
@@ -31,7 +32,7 @@ from mbkit.methods.tableaus import EmbeddedTableau, RosenbrockTableau, dormand_p
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.problem import IntegrationProblem
-from mbkit.simulate.singular_poses import AHEAD, LOOSEST, Approach
+from mbkit.simulate.singular_poses import LOOSEST, Approach
 from mbkit.simulate.solvers.gauss import AT_END, StepNearPose, StepPolynomial
 from mbkit.simulate.solvers.trajectory_record import AcceptedSteps, StoppedError, below_rounding, diverged
 from mbkit.simulate.solvers.vector_field import DivergenceError, Field, Rates
@@ -320,7 +321,7 @@ class AcrossPoses(RungeKuttaAttempts):
         self._begin(t, q, w)
         if k is not None and (h is None or t >= self._estimate_until):
             self.hold(k, stop)
-            self._usual, self._estimate_until = self._h / AHEAD, t + self._h
+            self._usual, self._estimate_until = self._h / STEPS_TO_POSE, t + self._h
         out = self.approach.crosses(max(h or 0.0, self._usual))
         if out:
             # A method of several steps leaves the constraints by its errors.

@@ -203,7 +203,7 @@ class TrajectoryRecord(RunRecord):
         if self._watch is not None:
             self._watch.start(self.reached, q, v)
         if self.passed is not None:
-            self.passed.began(self.reached, q)
+            self.passed.saw(self.reached, q)
 
     def take(self, accepted: AcceptedSteps, within: Within) -> bool:
         """Add steps; return whether to go on."""
@@ -227,9 +227,10 @@ class TrajectoryRecord(RunRecord):
         if steps:
             self._q = accepted.q[steps]
         if self.passed is not None:
-            self.passed.saw_all(accepted.t[1 : steps + 1], accepted.q[1 : steps + 1])
-        if self.passed is not None and hit is not None:
-            self.passed.saw(hit.t, hit.q)
+            ends = slice(1, steps + (hit is None))
+            self.passed.saw(accepted.t[ends], accepted.q[ends])
+            if hit is not None:
+                self.passed.saw(hit.t, hit.q)
         if hit is not None:
             self.stop_at(hit)
         elif lost:

@@ -95,7 +95,7 @@ class _Stepper(Stepper):
 
     def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
         if self.poses:
-            self._poses.saw(self._dyn, t, np.atleast_2d(q), self._members)
+            self._poses.saw(t, np.atleast_2d(q), self._members)
         return q, w
 
     def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
