@@ -291,12 +291,24 @@ def test_what_stands_for_ever_is_that_of_steps_that_hold_it(engine: str) -> None
         b.set_joint(joint.name, friction=30.0)
     dyn, q, v = mb.dynamics(b.build(), engine), np.array([[0.3, -0.2], [1.0, 0.5]]), np.zeros(2)
     push = np.array([1.0, -2.0])
-    held, stepped = (mb.simulate(dyn, q, v, DURATION, dt=STEP, torque=x) for x in (push, np.tile(push, (STEPS, 1))))
-    assert (held.q == stepped.q).all()
-    assert (held.q == q[:, None]).all()
-    assert not held.v.any()
-    assert held.stats.steps == stepped.stats.steps
-    assert held.stats.evaluations == 0 < stepped.stats.evaluations
+    table = push * np.linspace(0.5, 1.0, STEPS)[:, None]
+    ways = push, table, lambda *_: push
+    held, rows, stepped = (mb.simulate(dyn, q, v, DURATION, dt=STEP, torque=x) for x in ways)
+    for run in (held, rows):
+        assert (run.q == stepped.q).all()
+        assert (run.q == q[:, None]).all()
+        assert not run.v.any()
+        assert run.stats.steps == stepped.stats.steps
+        assert run.stats.evaluations == 0 < stepped.stats.evaluations
+    # The row that passes what holds lets go at its beginning, in one run and in a batch.
+    table[20:] *= 50
+    for run in (
+        mb.simulate(dyn, q, v, DURATION, dt=STEP, torque=table),
+        mb.simulate(dyn, q[0], v, DURATION, dt=STEP, torque=table),
+    ):
+        assert {e.t for e in run.events if e.name.endswith("lets go")} == {20 * STEP}
+        assert not run.v[..., :21, :].any()
+        assert run.v[..., 21, :].any(axis=-1).all()
     loose = mb.simulate(dyn, q, v, DURATION, dt=STEP, torque=50 * push)
     assert abs(loose.v[:, 1]).min() > 0
 

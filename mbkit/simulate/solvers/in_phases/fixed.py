@@ -217,8 +217,10 @@ class _Members:
         margins = np.empty((len(rows), n)) if compiled and self.side_by_side else None
         together, *room = self._room(rows, k, n)
         if stands:
-            every = np.arange(len(rows)), np.zeros(len(rows), dtype=np.intp), np.full(len(rows), start)
-            margins = np.repeat(self._of_states(rows, phase, *every, self.q[rows], self.v[rows]).min(1)[:, None], n, 1)
+            margins = np.full((len(rows), n), np.nan)
+            if not (self._timed or self.problem.torque.held):
+                every = np.arange(len(rows)), np.zeros(len(rows), dtype=np.intp), np.full(len(rows), start)
+                margins[:] = self._of_states(rows, phase, *every, self.q[rows], self.v[rows]).min(1)[:, None]
         result = self._solved(rows, phase, n, Grid(start, start + n * h, h, n, h), None if stands else margins, room)
         q, v = (x if self.side_by_side else x[None] for x in (result.q, result.v))
         count = q.shape[1]
@@ -328,9 +330,9 @@ class _Members:
         return out
 
     def _stands(self, phase: Phase) -> bool:
-        """Whether nothing moves, and nothing acts that changes with time."""
-        torque = self.problem.torque
-        return bool(phase.still.all()) and not (torque.held or torque.callable or self._timed)
+        """Whether nothing moves, so that margins alone may change."""
+        driven = self._timed and phase.dyn.model.constrained
+        return bool(phase.still.all()) and not (self.problem.torque.callable or driven)
 
     def _good(
         self,
