@@ -13,9 +13,15 @@ import mbkit as mb
 from mbkit import catalog
 from mbkit.engines import dynamics
 from mbkit.errors import EventError, InputError, UnknownNameError, UnsupportedError
+from mbkit.methods.registry import Tolerances
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import Event, at_energy, at_limits, at_section, simulate
-from tests.scenes import METHODS
+from mbkit.simulate.problem import IntegrationProblem
+from mbkit.simulate.progress import Progress
+from mbkit.simulate.solvers.adaptive import run_embedded
+from mbkit.simulate.solvers.stretches import Stretch, run_in_stretches
+from mbkit.simulate.torque import Torque
+from tests.scenes import METHODS, mounted
 from validation import closed_forms
 
 SCIPY = ("dop853", "radau", "bdf", "lsoda")
@@ -251,3 +257,59 @@ def test_an_event_that_fails_leaves_the_run_up_to_then(method: str) -> None:
         assert 0 < run.t[-1] <= 0.5 + 0.5
         assert run.stats.ended == "function_failed"
         assert np.isfinite(run.q).all()
+
+
+# Breaks: a run whose stretches change nothing is the run
+
+
+def swinging(save: np.ndarray | None, events: tuple[Event, ...] = ()) -> IntegrationProblem:
+    """Return two seconds of x = cos t."""
+    b = mounted("swing", "mass", "x", "prismatic", mass=1.0, axis=(1, 0, 0), stiffness=1.0)
+    dyn, torque, bar = dynamics(b.build(), "lagrangian"), Torque(None, b.build(), None, None), Progress(None, "")
+    return IntegrationProblem(
+        dyn, "rk853", np.ones(1), np.zeros(1), 0.0, 2.0, Tolerances(1e-12, 1e-12), torque, save, events, bar
+    )
+
+
+@pytest.mark.parametrize("save", [None, np.array([0.0, 0.3, 0.4, 1.1, 2.0])])
+def test_breaks_that_change_nothing_leave_the_run_as_it_is(save: np.ndarray | None) -> None:
+    ends, hits = [0.3, 1.1, 2.0], []
+    meets = Event(lambda t, q, v: q[0] - np.cos(0.3), "meets", terminal=False)
+    problem = swinging(save, (meets,))
+
+    def first(t: float, q: np.ndarray, v: np.ndarray) -> Stretch:
+        # The first break is a time, the others are events; one is at a saved time, and one at the end.
+        end = min(x for x in ends if x > t)
+        event = Event(lambda s, q, v: s - end, "break", direction=1)
+        where: dict[str, Any] = {"until": end} if t == 0 else {"ends": [event], "end": event.name}
+        return Stretch(dyn=problem.dyn, q=q, v=v, follow=follow, **where)
+
+    def follow(hit: Any, t: float, q: np.ndarray, v: np.ndarray, moved: bool) -> Stretch | None:
+        hits.append((t, moved))
+        return first(t, q, v) if t < 2.0 else None
+
+    record = run_in_stretches(problem, 0, first, lambda _: run_embedded, "")
+    t, q, v = record.states
+    assert np.isin(ends, t).all()
+    assert (np.diff(t) > 0).all()
+    assert save is None or np.array_equal(t, save)
+    assert np.abs(q[:, 0] - np.cos(t)).max() < 1e-11
+    assert np.abs(v[:, 0] + np.sin(t)).max() < 1e-11
+    assert [(x.name, pytest.approx(x.t, abs=1e-11)) for x in record.events] == [("meets", 0.3)]
+    assert [moved for _, moved in hits] == [True] * 3
+    assert record.reached == t[-1] == 2.0
+
+
+def test_stretches_that_end_where_they_begin_end_the_run() -> None:
+    problem, begun = swinging(None), list[float]()
+
+    def first(t: float, q: np.ndarray, v: np.ndarray) -> Stretch:
+        begun.append(t)
+        end = Event(lambda s, q, v: t + 1e-18 - s, "break")
+        return Stretch(dyn=problem.dyn, q=q, v=v, ends=[end], end="break", follow=lambda _, *state: first(*state[:3]))
+
+    record = run_in_stretches(problem, 0, first, lambda _: run_embedded, "no end at t = {t:g} s")
+    assert (record.ended, record.message[:9]) == ("step_too_small", "no end at")
+    assert len(record.states[0]) == 1
+    # Twice, a joint may let go and stop at once.
+    assert 2 < len(begun) < 100

@@ -152,16 +152,6 @@ class IntegrationProblem:
         """Return the place of the i-th state in the batch, None where there is none."""
         return None if self.batch is None else i
 
-    def saved_times(self) -> tuple[Array, Array]:
-        """Return the times to keep, and those to go through from the start to the end."""
-        if self.save is None:
-            raise InputError(
-                f"save: {self.method} does not tell its own steps; give the times to keep, "
-                f"such as [{self.start:g}, {self.end:g}]"
-            )
-        stops = self.stops if self.torque.samples is not None else [self.end]
-        return self.save, np.array([self.start, *sorted({*self.save.tolist(), *stops} - {self.start})])
-
     def report(self, i: int) -> Callable[[float], None]:
         """Return a function that reports the time that the i-th state has reached."""
         return lambda t: self.bar.update((i + (t - self.start) / self.duration) / len(self.q))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import pairwise
 from typing import Any, Final
 
@@ -18,7 +19,7 @@ import numpy as np
 from mbkit._check import EPS, Array
 from mbkit.engines import Dynamics
 from mbkit.engines.remote.dynamics import VersionDynamics
-from mbkit.errors import FunctionError, MbkitError
+from mbkit.errors import FunctionError, InputError, MbkitError
 from mbkit.methods.registry import method_of
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.run_data import SolverResult
@@ -217,8 +218,11 @@ def _below_rounding(solver: Any, duration: float) -> bool:
 def run_native(problem: IntegrationProblem) -> SolverResult:
     """Run the engine's integrator; nothing is kept after a trajectory's last bounded state."""
     method, grid, torque = method_of(problem.method), problem.grid, problem.torque
-    dyn, q0, v0 = problem.dyn, problem.q0, problem.v0
-    rollout = _in_its_process(dyn) if isinstance(dyn, VersionDynamics) else _in_mujoco(dyn)
+    q0, v0 = problem.q0, problem.v0
+    # MuJoCo is an extra.
+    dyn: Any = problem.dyn
+    apart = isinstance(dyn, VersionDynamics)
+    rollout = partial(dyn.own_run, method=method.scheme) if apart else partial(dyn.rollout, method.scheme)
     check_room((grid.steps + 1) * len(problem.q), q0.shape[-1] + v0.shape[-1])
     record, parts, now = GridRecord(problem), [(q0[..., None, :], v0[..., None, :])], (q0, v0)
     # MuJoCo's step is fixed for a rollout, so a shortened last step is a rollout of its own.
@@ -243,7 +247,7 @@ def run_native(problem: IntegrationProblem) -> SolverResult:
         def report(done: float, k: int = k, end: int = end) -> None:
             problem.bar.update((k + done * (end - k)) / grid.steps)
 
-        q, v = rollout(method.scheme, q0=q, v0=v, dt=grid.step(k), tau=tau, steps=end - k, progress=report)
+        q, v = rollout(q0=q, v0=v, dt=grid.step(k), tau=tau, steps=end - k, progress=report)
         q, v = (np.where(good[..., None, None], np.asarray(x), np.nan) for x in (q, v))
         parts.append((q[..., 1:, :], v[..., 1:, :]))
         now = q[..., -1, :], v[..., -1, :]
@@ -261,26 +265,6 @@ def run_native(problem: IntegrationProblem) -> SolverResult:
     return record.result()
 
 
-_Rollout = Callable[..., tuple[Array, Array]]
-
-
-def _in_mujoco(dyn: Dynamics) -> _Rollout:
-    # MuJoCo is an extra.
-    from mbkit.engines.mujoco.engine import MujocoDynamics
-
-    assert isinstance(dyn, MujocoDynamics)
-    return dyn.rollout
-
-
-def _in_its_process(dyn: VersionDynamics) -> _Rollout:
-    """Return the rollouts of an engine in an environment of its own."""
-
-    def rollout(integrator: str, **more: Any) -> tuple[Array, Array]:
-        return dyn.own_run(method=integrator, **more)
-
-    return rollout
-
-
 # Drake's own integrators, with a tolerance.
 
 
@@ -295,7 +279,14 @@ def run_drake(problem: IntegrationProblem) -> SolverResult:
 
     dyn = problem.dyn
     assert isinstance(dyn, DrakeDynamics)
-    scheme, (_, times), runs = method_of(problem.method).scheme, problem.saved_times(), list[DrakeRun]()
+    if problem.save is None:
+        raise InputError(
+            f"save: {problem.method} does not tell its own steps; give the times to keep, "
+            f"such as [{problem.start:g}, {problem.end:g}]"
+        )
+    samples = problem.stops if problem.torque.samples is not None else []
+    times = sorted({problem.start, *problem.save.tolist(), *samples, problem.end})
+    scheme, runs = method_of(problem.method).scheme, list[DrakeRun]()
 
     def walk(i: int, y: Array, record: TrajectoryRecord) -> Iterator[tuple[float, Array, Any]]:
         force = problem.torque.of_member(problem.member(i))
@@ -304,7 +295,7 @@ def run_drake(problem: IntegrationProblem) -> SolverResult:
         )
         runs.append(run)
         try:
-            for begin, t in pairwise(times.tolist()):
+            for begin, t in pairwise(times):
                 k = problem.interval(begin)
                 problem.sample(i, k, begin, y)
                 run.push(np.asarray(force(k)))
