@@ -523,11 +523,18 @@ def test_states_within_a_step_across_a_singular_pose_are_those_of_the_motion(met
     assert quad(lambda x: 1 / speed(x), run.q[-1, crank], 0.5)[0] == pytest.approx(0.7, rel=1e-7)
 
 
-def test_a_run_tells_once_of_the_poses_that_its_phases_pass() -> None:
-    """Upwards through the pose, round, and down through it again, by energy and quadrature."""
+@pytest.mark.parametrize(
+    ("method", "more", "speeds"), [("rk853", {"rtol": 1e-12}, [3.0]), ("rk4", {"dt": 1e-3}, [3.0, 2.8, 0.0])]
+)
+def test_a_run_tells_once_of_the_poses_that_its_phases_pass(
+    method: str, more: dict[str, float], speeds: list[float]
+) -> None:
+    """Upwards through the pose, round, and down through it again, by energy and quadrature; other members beside it."""
     dyn = mb.dynamics(parallelogram((0.05,) * 3, 0.05), "lagrangian")
-    run = simulated(dyn, turned(dyn.model, -0.1), 3.0 * turned(dyn.model, 1.0), 0.25, "rk853", rtol=1e-12)
+    v = np.array(speeds)[:, None] * turned(dyn.model, 1.0)
+    run = simulated(dyn, turned(dyn.model, -0.1), v if len(v) > 1 else v[0], 0.25, method, **more)
     (told,) = run.stats.doubts
+    assert len(v) == 1 or "2 of 3 trajectories passed singular poses; trajectory 0" in told
 
     def up(x: float) -> float:
         return float(9 - (9.81 * 1.25 * (np.sin(x) + np.sin(0.1)) + 0.2 * (x + 0.1)) / 0.25)

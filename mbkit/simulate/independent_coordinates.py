@@ -63,16 +63,17 @@ def integrate_on_charts(system: Embedded, request: RunRequest) -> tuple[RunData,
 
 def _run(system: Embedded, problem: IntegrationProblem, solver: Callable[[Dynamics], Solver]) -> SolverResult:
     charts = _Charts(system)
+    charts.saw(problem.start, problem.q0)
     if problem.equal_steps is None:
-        looked = replace(problem, passed=charts.passed)
-        record = run_in_stretches(looked, 0, charts.stretch, solver, _ENDLESS)
+        record = run_in_stretches(problem, 0, charts.stretch, solver, _ENDLESS)
+        # Charts look for poses on all of the way.
+        record.passed = charts.passed
         if record.ended == "event" and record.events[-1].name == _NEAR:
             record.ended, record.message = charts.undetermined(record.reached)
         result = assemble_result(problem, [record])
     else:
         steps = GridRecord(problem)
         run = SteppedRun(problem, _ChartStepper(charts, problem.method, steps), problem.v0.copy(), steps)
-        charts.passed.saw(problem.start, problem.q0)
         run.to_end()
         steps.poses = {0: charts.passed}
         result = steps.result(lambda _: run.why)
@@ -92,8 +93,8 @@ class _OnChart:
     Dependent coordinates are searched from those kept nearest in time, since a place far off may lie on another branch.
     """
 
-    def __init__(self, system: Embedded, passed: SingularPoses, t: float, q: Array, v: Array) -> None:
-        self.system, self.chart, self._passed = system, system.chart(q, t), passed
+    def __init__(self, system: Embedded, saw: Callable[[float, Array], None], t: float, q: Array, v: Array) -> None:
+        self.system, self.chart, self._saw = system, system.chart(q, t), saw
         self.dyn = system.on(self.chart, q, t)
         self.begin = Hit(f"independent: {system.names(self.chart)}", t, q.copy(), v.copy())
         #: Times of steps' ends and near them, and configurations there.
@@ -151,7 +152,7 @@ class _OnChart:
         """Return the configuration at or near a step's end, and keep it."""
         if self._places[-1][0] != t:
             self._places.append((t, at_time(self.dyn, t).configuration(u)))
-            self._passed.saw(*self._places[-1])
+            self._saw(*self._places[-1])
         return self._places[-1][1]
 
 
@@ -178,10 +179,17 @@ class _Charts:
         self._passes = not self.stays and system.model.time_parameter is None
         #: Configurations near singular poses with which stretches begin, by their times.
         self.near: dict[float, Array] = {}
+        self._seen = -np.inf
+
+    def saw(self, t: float, q: Array) -> None:
+        """Look for singular poses at the end of a step; a search within a step that was seen tells nothing."""
+        if t > self._seen:
+            self.passed.saw(t, q)
+            self._seen = t
 
     def stretch(self, t: float, q: Array, v: Array, *, across: bool = False) -> Stretch:
         """Return the stretch from a state on: on the best chart, or on all coordinates `across` a singular pose."""
-        on = _OnChart(self.system, self.passed, t, q, v)
+        on = _OnChart(self.system, self.saw, t, q, v)
         near = self.system.nearness(on.chart, q, t)
         if near < SINGULAR_VALUE_RATIO:
             self.near[t] = q
@@ -232,7 +240,7 @@ class _ChartStepper(Stepper):
             except DivergenceError:
                 if self._charts.stays:
                     raise
-        self._on = _OnChart(self._charts.system, self._charts.passed, t, q, v)
+        self._on = _OnChart(self._charts.system, self._charts.saw, t, q, v)
         self._record.events.append(self._on.begin)
         space = Space(self._on.dyn.model)
         self._step = make_step(self._method, Field(self._on.dyn, space), space)
@@ -248,7 +256,7 @@ class _ChartStepper(Stepper):
     def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
         assert self._on is not None
         charts, chart = self._charts, self._on.chart
-        charts.passed.saw(t, q)
+        charts.saw(t, q)
         system, before = charts.system, self._near
         self._near = system.nearness(chart, q, t) < SINGULAR_VALUE_RATIO
         if self._near and not before:

@@ -26,6 +26,7 @@ from mbkit.simulate.events import as_events
 from mbkit.simulate.problem import RUNS, IntegrationProblem, RunRequest, Solver
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.run_data import Acting, RunData, RunSettings, SolverResult
+from mbkit.simulate.singular_poses import describe_poses
 from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, Indices, check_room, save_times
 from mbkit.simulate.torque import RunWrenches, Torque, TorqueFunction
 
@@ -116,9 +117,10 @@ def integrate(
             read.sample(0, start, q, v, None if batch is None else np.arange(batch))
         applied = read.applied(jumps)
         outcome = _outcome(problem, chosen, in_parts)
+        passed = describe_poses(outcome.poses, batch, tolerance=chosen.kind == "adaptive")
+        doubts = (passed, *outcome.doubts) if passed else outcome.doubts
     seconds = time.perf_counter() - started
-    settings = RunSettings(start, q.copy(), v.copy(), setting, outcome.doubts)
-    doubts = outcome.doubts
+    settings = RunSettings(start, q.copy(), v.copy(), setting, doubts)
     if request.doubt and outcome.ended in ("finished", "event"):
         states = settings.with_start(outcome.t, outcome.q, outcome.v)
         compiled = chosen.kind == "native" or (_compiles(own) and not read.callable)

@@ -24,7 +24,6 @@ from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.events import Event
 from mbkit.simulate.progress import Progress, ProgressFunction
 from mbkit.simulate.run_data import SolverResult
-from mbkit.simulate.singular_poses import SingularPoses
 from mbkit.simulate.time_grid import Grid, Indices, check_room
 from mbkit.simulate.torque import RunWrenches, Torque, TorqueFunction
 
@@ -78,8 +77,6 @@ class IntegrationProblem:
     # Equal steps, and the indices of the states to keep, of a method with a fixed step.
     equal_steps: Grid | None = None
     kept: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
-    # What looks for singular poses in the run of which this is a part.
-    passed: SingularPoses | None = None
 
     def __post_init__(self) -> None:
         kept = self.save if self.equal_steps is None else self.kept

@@ -5,8 +5,8 @@ Result of a solver, and the cost and end of a run.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
 from itertools import pairwise
 from typing import Any, Final, Literal
 
@@ -20,6 +20,7 @@ from mbkit.errors import FunctionError, InputError, UnsupportedError
 from mbkit.methods.registry import Tolerances
 from mbkit.model import Body, Frame, Model
 from mbkit.simulate.events import Hit
+from mbkit.simulate.singular_poses import SingularPoses
 from mbkit.simulate.torque import Applied, ForceFunctions, PiecewiseConstantTorque, SampledTorque
 
 Ended = Literal["finished", "event", "diverged", "step_too_small", "function_failed"]
@@ -84,7 +85,7 @@ class SolverResult(Stats):
     """Kept states of a run, with its cost and end.
 
     `last` is the last good configuration of the first trajectory that could not go on, where the method reports it;
-    `error` is that of a torque or event function.
+    `error` is that of a torque or event function, `poses` are the singular ones that each trajectory passed.
     """
 
     t: Array
@@ -93,6 +94,7 @@ class SolverResult(Stats):
     events: tuple[Hit, ...] = ()
     error: FunctionError | None = None
     last: Array | None = None
+    poses: Mapping[int, SingularPoses] = field(default_factory=dict)
 
     def stats(self, **more: Any) -> Stats:
         """Return the cost and the end alone, with what else is known of them."""

@@ -9,6 +9,7 @@ vanish do so at a rate. At rest they do not, and no equation says which branch c
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Final
 
@@ -174,6 +175,13 @@ class SingularPoses:
         """The times of the poses, up to the last state that was taken in."""
         self._look(last=True)
         return self._times
+
+    def join(self, part: SingularPoses, later: float = 0.0, until: float = math.inf) -> None:
+        """Take over those that a part of the run passed up to a time, s; its own times count from `later`."""
+        last = self._times[-1] if self._times else -math.inf
+        times = [t + later for t in part.times if last < t + later <= until]
+        if times:
+            self._times, self.rows = [*self._times, *times], part.rows
 
     def _look(self, *, last: bool) -> None:
         """Look for poses in the steps that are kept, in the last one too where no other follows."""

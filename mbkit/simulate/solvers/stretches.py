@@ -109,6 +109,8 @@ def _to_end(
         result = _solved(problem, record, stretch, begun, t, solver)
         record.add(result)
         record.last, record.doubts = result.last, [*record.doubts, *result.doubts]
+        if record.passed and 0 in result.poses:
+            record.passed.join(result.poses[0])
         hits = [_of_run(hit, stretch, problem.member(i)) for hit in result.events]
         record.events += [hit for hit in hits if hit.name != stretch.end]
         last = hits[-1] if result.ended == "event" else None
@@ -159,7 +161,6 @@ def _solved(
         torque=stretch.torque(torque),
         save=None if rows is None else np.append(rows[(rows > t) & (rows < until)], t + span),
         events=(*stretch.events(problem.events), *stretch.ends),
-        passed=record.passed,
         bar=Progress(lambda done: report(t + done * span), ""),
     )
     return solver(stretch.dyn)(own)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -18,7 +18,7 @@ from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.events import Hit, State, Watch
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.run_data import Ended, SolverResult, Stats
-from mbkit.simulate.singular_poses import SingularPoses, describe_poses
+from mbkit.simulate.singular_poses import SingularPoses
 from mbkit.simulate.solvers.vector_field import DIVERGED, are_bounded
 from mbkit.simulate.time_grid import Indices
 
@@ -48,7 +48,7 @@ class RunRecord:
         self.last: Array | None = None
         self.error: FunctionError | None = None
         self.early: dict[int, tuple[Ended, str]] = {}
-        self.poses: Mapping[int, SingularPoses] = {}
+        self.poses: dict[int, SingularPoses] = {}
 
     def count(self, part: RunRecord | Stats) -> None:
         """Add the cost of a part of the run."""
@@ -60,7 +60,6 @@ class RunRecord:
         """Return the result with states (N, K, ·) at common times, and the time that each trajectory reached."""
         batch = self.problem.batch
         ended, message = self._end(reached)
-        passed = describe_poses(self.poses, batch, tolerance=self.problem.equal_steps is None)
         return SolverResult(
             t=np.array(t, dtype=np.float64),
             q=q[0] if batch is None else q,
@@ -76,7 +75,8 @@ class RunRecord:
             error=self.error,
             last=self.last,
             chosen=self.chosen,
-            doubts=tuple(dict.fromkeys(filter(None, (passed, *self.doubts)))),
+            doubts=tuple(dict.fromkeys(self.doubts)),
+            poses=self.poses,
         )
 
     def _end(self, reached: list[float]) -> tuple[Ended, str]:
@@ -188,7 +188,7 @@ class TrajectoryRecord(RunRecord):
         self._model, self._space, self._save = dyn.model, space, problem.save
         self._watch = Watch(problem.events, member) if problem.events else None
         own = dyn if member is None or not dyn.model.constrained else dyn._of_samples([member])
-        self.passed = (problem.passed or SingularPoses(own)) if dyn._projects else None
+        self.passed = SingularPoses(own) if dyn._projects else None
         self.reached = problem.start
         self._q: Array | None = None
         self.ended: Ended = "finished"
@@ -391,8 +391,7 @@ def assemble_result(
         reached[record.index] = float(record.reached)
         if record.ended != "finished":
             run.early[record.index] = record.ended, record.message
-    # The whole run tells of the poses that its parts pass.
-    run.poses = {record.index: record.passed for record in records if record.passed and not problem.passed}
+    run.poses = {record.index: record.passed for record in records if record.passed}
     states = [record.states for record in records]
     if batch is None:
         t, q, v = states[0][0], *(x[None] for x in states[0][1:])

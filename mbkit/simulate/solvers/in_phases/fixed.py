@@ -24,6 +24,7 @@ from mbkit.simulate.events import Hit
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.run_data import Ended, SolverResult
+from mbkit.simulate.singular_poses import SingularPoses
 from mbkit.simulate.solvers.in_phases.phases import Phase, Phases, force_of, of_each, side_by_side
 from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.time_grid import Grid, Indices
@@ -245,6 +246,10 @@ class _Members:
             self._keep(rows, k, good, q, v)
         self.q[rows], self.v[rows] = q[last], v[last]
         self.k[rows] = k + good
+        for j, passed in result.poses.items():
+            # States behind the step in which a phase ends are none of the run.
+            found = record.poses.setdefault(int(self.members[rows[j]]), SingularPoses(self.phases.dyn))
+            found.join(passed, (k[j] - k.min()) * h, grid.time(int(k[j])) + (good[j] + 1) * h)
         record.error = result.error
         if record.error is None:
             self._lose(rows[(good == limit) & (limit < np.minimum(left, n))], result)
@@ -326,7 +331,6 @@ class _Members:
                 more = {"behind": [self.margin_part], "margins": margins, "bound": self.phases.bounds(phase)}
             out = run_rollout(own, record=GridRecord(own, *room), **more)
         self._record.count(out)
-        self._record.doubts += out.doubts
         return out
 
     def _stands(self, phase: Phase) -> bool:
