@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from itertools import combinations_with_replacement
 from math import fsum, prod, sqrt
 from typing import Any, ClassVar, Final
@@ -221,11 +221,7 @@ class Tableau:
         return space.retract(q, u), w + dw, u
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restored, (type(self), {f.name: getattr(self, f.name) for f in fields(self)})
-
-
-def _restored(kind: type, attributes: dict[str, Any]) -> Any:
-    return _unchecked(kind, **attributes)
+        return partial(_unchecked, type(self), **{f.name: getattr(self, f.name) for f in fields(self)}), ()
 
 
 class ImplicitTableau(Tableau):

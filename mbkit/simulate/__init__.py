@@ -3,9 +3,10 @@
 Start with `run`: `simulate` integrates, checks, and returns a `Trajectory`. `integrate` reads the arguments, makes an
 `IntegrationProblem` of them (`problem`), and hands it to the solver that the method's entry in `methods` names.
 `solvers` has one module for each way to integrate: fixed steps in Python or compiled, adaptive ones, `auto`, and those
-of SciPy, heyoka, MuJoCo and Drake. Each returns a `SolverResult` (`result`).
-`run_data` has the states and what follows from them; `trajectory` adds the checks that integrate once more.
-`diagnostics` asks after a run whether its numbers can be believed; its doubts stand in the run's `Stats`.
+of SciPy, heyoka, MuJoCo and Drake. Each returns a `SolverResult`. Phases of dry friction and charts are `stretches` of
+a run, each with a solver's run of its own. `run_data` has the states and what follows from them; `trajectory` adds the
+checks that integrate once more. `checks` asks after a run whether its numbers can be believed; its doubts stand in the
+run's `Stats`.
 
 In: an engine's `Dynamics`, start states, torques (`torque`), events. Out: times and states, with what they cost.
 Callers: users, every study, `mbkit simulate`.

@@ -24,7 +24,7 @@ from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, diverged
 from mbkit.simulate.torque import Torque
 
 #: Most stretches in a row that end where they begin.
-_MAX_EMPTY: Final = 20
+MAX_EMPTY: Final = 20
 #: Largest length of one of these, relative to the run's times.
 _NO_TIME: Final = 1e-12
 
@@ -107,7 +107,7 @@ def _to_end(
             break
         begun, t = t, min(stretch.until, problem.end)
         result = _solved(problem, record, stretch, begun, t, solver)
-        record.add(result)
+        record.count(result)
         record.last, record.doubts = result.last, [*record.doubts, *result.doubts]
         if record.passed and 0 in result.poses:
             record.passed.join(result.poses[0])
@@ -120,14 +120,16 @@ def _to_end(
         inner[-1:] &= not result.finished
         record.keep(result.t[inner], q[inner], v[inner])
         if not result.finished:
-            record.ended, record.message, record.error = result.ended, result.message, result.error
+            assert isinstance(result.reached, float)
+            record.reached, record.error = result.reached, result.error
+            record.ended, record.message = result.ended, result.message
             break
         t, q, v = (t, q[-1], v[-1]) if last is None else (last.t, last.q, last.v)
         record.reached = t
         problem.report(i)(t)
         moved = t - begun > _NO_TIME * max(abs(begun), problem.duration)
         empty, follow, stretch = 0 if moved else empty + 1, stretch.follow, None
-        if empty > _MAX_EMPTY:
+        if empty > MAX_EMPTY:
             return False
         if last is not None or t < problem.end:
             problem.sample(i, problem.interval(t), t, np.concatenate([q, v]))

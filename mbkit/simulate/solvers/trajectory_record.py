@@ -237,12 +237,6 @@ class TrajectoryRecord(RunRecord):
             self.stop(diverged())
         return hit is None and not lost
 
-    def add(self, run: Stats) -> None:
-        """Add the cost of a part that was a run of its own."""
-        self.count(run)
-        assert isinstance(run.reached, float)
-        self.reached = run.reached
-
     def keep(self, t: Array, q: Array, v: Array) -> None:
         """Keep states, (n,), (n, nq) and (n, nv), in mbkit's velocities."""
         if len(t):

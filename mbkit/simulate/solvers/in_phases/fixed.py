@@ -21,18 +21,15 @@ from mbkit.methods.registry import method_of
 from mbkit.model.integration_space import Space
 from mbkit.model.parts import STOPPED
 from mbkit.simulate.events import Hit
-from mbkit.simulate.problem import IntegrationProblem
+from mbkit.simulate.problem import IntegrationProblem, Solver
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.run_data import Ended, SolverResult
 from mbkit.simulate.singular_poses import SingularPoses
 from mbkit.simulate.solvers.in_phases.phases import Phase, Phases, force_of, of_each, side_by_side
+from mbkit.simulate.solvers.stretches import MAX_EMPTY
 from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.time_grid import Grid, Indices
 
-#: problem -> result, of a smooth problem.
-Solver = Callable[[IntegrationProblem], SolverResult]
-#: Phases in a row that end where they begin, at most.
-MAX_EMPTY_PHASES: Final = 20
 UNDECIDED: Final = "stopped, as which joints rest cannot be decided"
 #: Steps of a block, at least, and the factor by which blocks grow.
 _BLOCK, _GROWTH = 32, 4
@@ -424,7 +421,7 @@ class _Members:
         """
         v, leaving = self.phases.after(before, self.times(t), *state[:2], self.forces(rows), state[2])
         self._empty[rows] = np.where(moved, 0, self._empty[rows] + 1)
-        decided = self._empty[rows] <= MAX_EMPTY_PHASES
+        decided = self._empty[rows] <= MAX_EMPTY
         for i, time in zip(rows[~decided].tolist(), t[~decided].tolist(), strict=True):
             self._end_early(i, "step_too_small", f"{UNDECIDED} at t = {time:.9g} s: their phases end where they begin")
         self.q[rows], self.v[rows] = state[0], v
