@@ -6,6 +6,7 @@ import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -866,6 +867,14 @@ def test_moreau_s_steps_beside_rows_in_machine_code_are_those_in_python(
     assert np.abs(run.q - other.q).max() < 1e-13
     assert np.abs(run.v - other.v).max() < 1e-12
     np.testing.assert_array_equal(run.v == 0, other.v == 0)
+
+
+def test_moreau_s_steps_of_a_robot_whose_code_takes_long_to_make_are_in_python() -> None:
+    for name, few in (("delta_robot", False), ("planar_3rrr", True)):
+        dyn, *_ = rubbing(name, 2, compile=False)
+        dyn.__class__ = type("Compiling", (type(dyn),), {"_compiles_steps": True})
+        problem: Any = SimpleNamespace(dyn=dyn, torque=SimpleNamespace(callable=False))
+        assert moreau._compiles(problem) == few
 
 
 def test_moreau_s_steps_in_machine_code_follow_a_table_that_is_shaken(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -143,6 +143,9 @@ def test_of_a_batch_machine_code_decides_which_of_all_patterns_it_is() -> None:
     every, fits = consistent(mass_matrices(masses, q), tau, f, s)
     same = ((every == 0) == (a == 0)).all(axis=-1) & (np.abs(every - a).max(axis=-1) <= 1e-11 * np.abs(every).max())
     assert (same & fits).any(axis=0).all()
+    # The code of many joints takes longer to make than it saves.
+    many = mb.dynamics(chain(*(np.ones(19) for _ in range(3))), "lagrangian", compile=True)
+    assert many._jumps._rounds(many) is None
 
 
 @pytest.mark.thorough("1")
