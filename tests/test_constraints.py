@@ -404,6 +404,7 @@ def test_a_choice_that_stays_ends_at_its_singular_pose(rod):
     assert steps.stats.ended == "step_too_small"
     assert "x no longer" in steps.stats.message
     assert steps.t[-1] == steps.stats.reached == steps.events[-1].t
+    assert steps.stats.evaluations == 4 * steps.stats.steps
     assert steps.q[-1, 0] == pytest.approx(1.5, abs=1e-6)
     with pytest.raises(InputError, match="singular pose"):
         mb.simulate(rod.embedded(["x"]), [1.5, 0.0], [0.0, 1.0], 1.0, "rk853")

@@ -73,8 +73,10 @@ def _run(system: Embedded, problem: IntegrationProblem, solver: Callable[[Dynami
         result = assemble_result(problem, [record])
     else:
         steps = GridRecord(problem)
-        run = SteppedRun(problem, _ChartStepper(charts, problem.method, steps), problem.v0.copy(), steps)
+        stepper = _ChartStepper(charts, problem.method, steps)
+        run = SteppedRun(problem, stepper, problem.v0.copy(), steps)
         run.to_end()
+        steps.evaluations = sum(x.evaluations for x in stepper.fields)
         steps.poses = {0: charts.passed}
         result = steps.result(lambda _: run.why)
     poses = charts.near | {hit.t: hit.q for hit in result.events if hit.name == _NEAR}
@@ -231,6 +233,8 @@ class _ChartStepper(Stepper):
         self._charts, self._method, self._record = charts, method, record
         self._on: _OnChart | None = None
         self._step: Step
+        #: One for each chart, which count evaluations.
+        self.fields: list[Field] = []
         self._near = False
 
     def __call__(self, t: float, h: float, q: Array, v: Array, force: Force) -> tuple[Array, Array]:
@@ -243,7 +247,8 @@ class _ChartStepper(Stepper):
         self._on = _OnChart(self._charts.system, self._charts.saw, t, q, v)
         self._record.events.append(self._on.begin)
         space = Space(self._on.dyn.model)
-        self._step = make_step(self._method, Field(self._on.dyn, space), space)
+        self.fields.append(Field(self._on.dyn, space))
+        self._step = make_step(self._method, self.fields[-1], space)
         return self._stepped(self._on, t, h, q, v, force)
 
     def _stepped(self, on: _OnChart, t: float, h: float, q: Array, v: Array, force: Force) -> tuple[Array, Array]:
