@@ -244,7 +244,7 @@ def test_redundant_rows_are_named():
         ([(x - y) ** 2], r"constraints\[0\] .* has no slope where it holds"),
         ([sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1], "holds by itself"),
         # With a slope that is rounding wherever it is looked at.
-        ([sp.sin(2 * x + y) - sp.sin(2 * x) * sp.cos(y) - sp.cos(2 * x) * sp.sin(y)], "holds by itself"),
+        ([32 * (sp.sin(2 * x + y) - sp.sin(2 * x) * sp.cos(y) - sp.cos(2 * x) * sp.sin(y))], "holds by itself"),
     ],
 )
 def test_rows_are_named_wherever_they_are_met(rows, told):
@@ -270,6 +270,8 @@ def test_a_square_that_is_nearly_zero_is_told_from_a_row_that_bends():
     # Beside x = 0 its slope is a million times that where it holds: x stays, and y falls freely.
     bends = pendulum(constraints=[x + 10**7 * x**3])
     assert bends.project([0.0, 0.5], [0.0, 0.0])[0] == pytest.approx([0.0, 0.5], abs=1e-15)
+    # A row in tiny units has a slope, if a small one.
+    assert pendulum(constraints=[5e-14 * (x - y)]).project([0.3, 0.1], [0.0, 0.0])[0] == pytest.approx([0.2, 0.2])
 
 
 def test_rows_that_a_late_value_makes_the_same_are_named():
