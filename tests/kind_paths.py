@@ -1060,5 +1060,3 @@ def _lint(x: Example, folder: Path) -> Told:
 
 #: Rows and columns of the matrix.
 ROWS = (*EXAMPLES, *TYPES)
-#: What no column runs, and why.
-NOT_YET = ("terms of Newton, MuJoCo Warp and MJX, whose gates alone are asked where their environments are not",)

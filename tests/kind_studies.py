@@ -59,7 +59,6 @@ from tests.kind_paths import (
     CLOSE,
     COLUMNS,
     DURATION,
-    NOT_YET,
     QUATERNIONS,
     ROWS,
     STEP,
@@ -87,7 +86,10 @@ from tests.test_engine_versions import present
 from tests.written_math import assigned, lines_of_latex, lines_of_text, number, plain
 from validation.gpu import on_device
 
-__all__ = ["COLUMNS", "NOT_YET", "ROWS", "cell", "registered"]
+__all__ = ["ABSENT", "COLUMNS", "ROWS", "cell", "registered"]
+
+#: Why the terms of an engine are not asked for.
+ABSENT = "its gate takes it, and its environment is not here"
 
 # Engines in environments of their own
 
@@ -150,7 +152,7 @@ def _trained(x: Example, folder: Path, which: str) -> Told:
             lost = package.path.refuses(x.model)
             if lost:
                 raise AssertionError(f"not asked: {lost}") from None
-            raise NotAskedError("its gate takes it, and its environment is not here") from None
+            raise NotAskedError(ABSENT) from None
     raise AssertionError("no process was asked for")
 
 
