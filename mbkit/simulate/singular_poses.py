@@ -14,6 +14,7 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mbkit._check import CONSISTENT, EPS, Array
 from mbkit.engines import Dynamics
@@ -196,25 +197,27 @@ class SingularPoses:
         pace = np.pad(np.abs(np.diff(far)) / np.diff(t), 1, constant_values=np.inf)
         reach = STEPS_TO_POSE * np.diff(t) * np.max([pace[:-2], pace[1:-1], pace[2:]], axis=0)
         end = len(t) - (not last)
-        for k in range(self._new, end):
-            if far[k - 1] + far[k] <= 2 * reach[k - 1]:
-                self._look_in(t, q, far, k)
+        near = np.flatnonzero(far[:-1] + far[1:] <= 2 * reach) + 1
+        near = near[(near >= self._new) & (near < end)]
+        if len(near):
+            ends = np.union1d(near - 1, near)
+            J = manifold_of(at_times(dyn, t[ends], 1)).jacobian(q[ends])
+            U, sizes, Vt = np.linalg.svd(np.nan_to_num(J), full_matrices=False)
+            rows, at_pose = U @ Vt, np.full(len(t), False)
+            at_pose[ends] = sizes[:, -1] <= AT_POSE * sizes[:, 0]
+            turn = rows[ends.searchsorted(near)] @ rows[ends.searchsorted(near - 1)].swapaxes(-1, -2)
+            passed = np.linalg.eigvalsh(turn + turn.swapaxes(-1, -2))[:, 0] < 0
+            for k in near[passed | at_pose[near] | at_pose[near - 1]].tolist():
+                self._passed_in(t, q, far, k, at_pose)
         kept = max(end - 2, 0)
         self._t, self._q, self._new = t[kept:], q[kept:], max(end - kept, 1)
 
-    def _look_in(self, t: Array, q: Array, far: Array, k: int) -> None:
-        """Look for a pose in the step that ends at the k-th state."""
-        nearest, rows = k - 1 if far[k - 1] < far[k] else k, []
-        for i in (k - 1, k):
-            U, sizes, Vt = np.linalg.svd(manifold_at(self._dyn, t[i]).jacobian(q[i]), full_matrices=False)
-            rows.append(U @ Vt)
-            if sizes[-1] <= AT_POSE * sizes[0]:
-                when = t[i]
-                break
+    def _passed_in(self, t: Array, q: Array, far: Array, k: int, at_pose: NDArray[np.bool_]) -> None:
+        """Keep the time of a pose in the step that ends at the k-th state, and the rows that depend on each other."""
+        nearest = k - 1 if far[k - 1] < far[k] else k
+        if at_pose[k - 1] or at_pose[k]:
+            when = t[k - 1 if at_pose[k - 1] else k]
         else:
-            turn = rows[1] @ rows[0].T
-            if not np.linalg.eigvalsh(turn + turn.T)[0] < 0:
-                return
             near = slice(max(k - 2, 0), k + 2)
             ends = t[near] - t[k - 1]
             roots = np.roots(np.polyfit(ends, np.where(ends > 0, -far[near], far[near]), len(ends) - 1))
