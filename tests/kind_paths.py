@@ -534,9 +534,10 @@ def _loads(x: Example, folder: Path) -> Told:
     loads, worst = dyn.joint_wrenches(x.q, x.v, *under), off(rest, 0 * rest)
     if len(loads) != len(joints):
         raise AssertionError("not one load for each joint")
-    # What a gear or a drive adds there is not known here.
-    if not x.name.startswith(("coupler", "motion", "mimic")):
-        inside = x.name.startswith(("joint.", "coupling."))
+    # What a gear or a drive adds there is not known here, nor that of rows beside numbers of joints.
+    acts = {name.partition(".")[0] for name in x.model.acts}
+    inside = bool(acts & {"joint", "coupling"})
+    if not acts & {"coupler", "motion", "mimic"} and not (inside and x.model.constrained):
         torques = x.force(x.accelerated(), bodies=True) if inside else x.tau
         for load, joint in zip(loads, joints, strict=True):
             if joint.kind in ("revolute", "prismatic"):

@@ -61,7 +61,7 @@ ONE_BY_ONE: Final = _OF_ALL | dict.fromkeys(("universal", "spherical_zyx"), _one
 STACKED: Final = _OF_ALL | dict.fromkeys(("universal", "spherical_zyx"), _stacked)
 SENT: Final = Path("sent", "", joint_types(*ONE_BY_ONE) | OF_TREES | OF_COUPLINGS, instead=SOLVED)
 SENT_TO_DRAKE: Final = replace(SENT, name="sent to drake", carries=SENT.carries - {ROTORS_OF_SEVERAL})
-NEWTON: Final = replace(SENT, name="newton", carries=SENT.carries - joint_types("helical"))
+NEWTON: Final = replace(SENT_TO_DRAKE, name="newton", carries=SENT_TO_DRAKE.carries - joint_types("helical"))
 _RUN: Final = SENT.carries - BESIDE - {"mimic"}
 _WHY: Final = {"mimic": "it would have to be reduced; load with mimic='free'"}
 REMOTE_RUNS: Final = Path("remote runs", "", _RUN, _WHY, instead=OF_ANY_ENGINE)
