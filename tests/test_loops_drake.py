@@ -164,5 +164,5 @@ def test_prescribed_motions_and_open_starts_are_refused() -> None:
     q, v = mb.dynamics(driven, "lagrangian", compile=False).project(*bare.start())
     with pytest.raises(UnsupportedError, match="joint 'crank' is moved in time"):
         mb.simulate(mb.dynamics(driven, "drake"), q, v, 0.01, "drake_sap")
-    with pytest.raises(InputError, match=r"q0: the constraints .* f = 0"):
+    with pytest.raises(InputError, match=r"q0: \w+ is open there: loop .*project\(q0, v0\)"):
         mb.simulate(mb.dynamics(model, "drake"), [0.5, 0.0, 1.0], np.zeros(3), 0.01, "drake_sap")

@@ -114,7 +114,7 @@ def test_an_open_start_is_refused() -> None:
         lambda: mb.work_precision(bare.described(), ["lagrangian"], ["rk4"], q0=q + 0.01, v0=v),
         lambda: reference(bare.described(), q + 0.01, v, 1.0, TIMES),
     ):
-        with pytest.raises(InputError, match=r"f = 0.*project\(q0, v0\)"):
+        with pytest.raises(InputError, match=r"is open there: loop .* by .*project\(q0, v0\)"):
             study()
 
 
