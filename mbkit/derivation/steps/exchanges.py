@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import casadi as ca
 
+from mbkit.derivation.mass_matrix_solve import solve
 from mbkit.derivation.steps.symbols import choose
 from mbkit.methods.exchanges import Operations, Problem, Signs, exchange
 
@@ -16,18 +17,8 @@ _ROUNDS: Final = 3
 
 def restricted(A: Any, right: Any, on: Any) -> Any:
     """Return the x with A x = right in the entries that are on, and zero in the others, of a definite A."""
-    n = right.numel()
-    a = [[A[i, j] * on[i] * on[j] + (1 - on[i]) * (i == j) for j in range(i + 1)] for i in range(n)]
-    x = [right[i] * on[i] for i in range(n)]
-    for j in range(n):
-        for i in range(j + 1, n):
-            factor = a[i][j] / a[j][j]
-            x[i] = x[i] - factor * x[j]
-            for k in range(j + 1, i + 1):
-                a[i][k] = a[i][k] - factor * a[k][j]
-    for i in reversed(range(n)):
-        x[i] = (x[i] - sum(a[k][i] * x[k] for k in range(i + 1, n))) / a[i][i]
-    return ca.vertcat(*x)
+    own = A * ca.mtimes(on, on.T) + ca.diag(1 - on)
+    return solve(own, right * on, range(right.numel()))
 
 
 def _behind(x: Any) -> Any:

@@ -45,7 +45,7 @@ class Stretch:
     begins : sequence of Hit
         Events of the run with which it begins.
     end : str
-        Name of the event that ends it and is none of the run.
+        Name of the event that ends it, which the record of the run leaves out.
     start, states, torque, events : callable
         The state on its own coordinates; states of these at times, (n, ·), on those of the run; and the run's force
         and its events on its own coordinates.
