@@ -96,11 +96,14 @@ ABSENT = "its gate takes it, and its environment is not here"
 
 @cache
 def _elsewhere(engine: str) -> Any:
-    """Return an engine whose environment is the present interpreter."""
+    """Return an engine of the installed version: its own environment, or the present interpreter as one."""
     os.environ.setdefault("MBKIT_ENVIRONMENTS", tempfile.mkdtemp())
     if find_spec(PACKAGES[engine].module.partition(".")[0]) is None:
         raise NotAskedError(f"{engine} is not installed")
-    return present(engine, version(PACKAGES[engine].distribution))
+    package = PACKAGES[engine].distribution
+    if environment.exists(package, version(package)):
+        return mb.engine(f"{engine}=={version(package)}")
+    return present(engine, version(package))
 
 
 def _sent(x: Example, which: str) -> mb.Dynamics:

@@ -53,6 +53,8 @@ def script(path: Path, text: str) -> Path:
 def present(engine: str, version: str, before: str = "") -> EngineVersion:
     """Make an environment of the present interpreter, and return its engine."""
     python = environment.python_of(environment.place(PACKAGES[engine].distribution, version))
+    # A real environment links to an interpreter, over which the script would be written.
+    assert not python.is_symlink()
     script(python, f'{before}\nexec "{sys.executable}" "$@"')
     return mb.engine(f"{engine}=={version}")
 
