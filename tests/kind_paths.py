@@ -132,7 +132,9 @@ def told(name: str, path: str, folder: Path) -> Cell:
                 isinstance(error, UnsupportedError) or path in ("lock", "its number as a parameter", "steady motion")
             ):
                 return Cell("crash", text=text)
-            return Cell("refused" if named(name, x, text) else "unnamed", text=text)
+            # A path that asks for a kind names that where a model has none.
+            missing = [GATES[g].asks[1] for g in col.gates if g in GATES and GATES[g].asks[1]]
+            return Cell("refused" if named(name, x, text) or any(m in text for m in missing) else "unnamed", text=text)
         except Exception as error:
             return Cell("crash", text=f"{type(error).__name__}: {' '.join(str(error).split())}")
     error, notes = out if isinstance(out, tuple) else (out, ())
