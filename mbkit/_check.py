@@ -16,6 +16,8 @@ from mbkit.errors import InputError, MbkitWarning, UnsupportedError, warn
 Array = NDArray[np.float64]
 K = TypeVar("K")
 V = TypeVar("V")
+#: Bits of a double's significand.
+DOUBLE_BITS: Final = 53
 #: Distance from 1 to the next double.
 EPS: Final = float(np.finfo(float).eps)
 # Tolerances by what leaves them; a decision that needs another one says why where it is made.
@@ -31,13 +33,19 @@ CONSISTENT: Final = 1e-8
 PRINTED: Final = 1e-6
 #: Larger than anything that moves, and the products of several still fit a double.
 MAX_MAGNITUDE: Final = 1e30
+#: A state with a number of this size has diverged: no machine goes there, and its energy can still be computed.
+BOUND: Final = 1e100
+#: Least size by which something is divided.
+TINY: Final = 1e-300
+#: Step of central differences, relative to what changes: there truncation and rounding are alike.
+CENTRAL_STEP: Final = EPS ** (1 / 3)
 #: Random places, poses or states at which a property of formulas is looked for.
 PROBES: Final = 4
 #: Imaginary step of derivatives that are right to rounding.
 COMPLEX_STEP: Final = 1e-30
 _MAX_SUMMED: Final = 64
-#: Numbers of a piece of an array that is checked and copied in pieces.
-_PIECE_SIZE: Final = 2**16
+#: Numbers of a piece of an array that is checked, copied or computed in pieces.
+PIECE_SIZE: Final = 2**16
 _SHORT: Final = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 3, 60, 120, 60
 
@@ -97,16 +105,16 @@ def finite_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     array = real_array(name, value)
     if array.shape != shape:
         raise InputError(f"{name}: expected shape {shape}, got {array.shape}")
-    if array.size <= _PIECE_SIZE:
+    if array.size <= PIECE_SIZE:
         require_finite(name, array)
         return array.copy()
     # In pieces that stay in a cache; between them Ctrl-C is heard.
     flat, out = array.reshape(-1), np.empty(array.size)
-    for start in range(0, len(flat), _PIECE_SIZE):
-        piece = flat[start : start + _PIECE_SIZE]
+    for start in range(0, len(flat), PIECE_SIZE):
+        piece = flat[start : start + PIECE_SIZE]
         if not all_finite(piece):
             require_finite(name, array)
-        out[start : start + _PIECE_SIZE] = piece
+        out[start : start + PIECE_SIZE] = piece
     return out.reshape(shape)
 
 

@@ -34,6 +34,8 @@ INTERRUPTED = 130
 CLOSING_SECONDS = 0.3
 #: Seconds that the main thread has for what it does at Ctrl-C.
 _HANDLER_SECONDS = 0.05
+#: Seconds between two looks at a run: for Ctrl-C where other code runs, and for reports of how far it is.
+LOOK_SECONDS = 0.1
 _LINE = b"interrupted: the command did not finish\n"
 #: To the line's beginning, clear it, and show the cursor that a progress bar hides.
 _CLEAR = b"\r\x1b[2K\x1b[?25h"

@@ -14,14 +14,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mbkit._check import Array
+from mbkit._check import PRINTED, Array
 from mbkit.errors import NumericalError
 
 #: Part of a row that is left of it, once the others are taken away, up to which it follows from them: rounding of J at
 #: a pose that is known to all digits, times the some thousand operations that lead to it.
 DEPENDENT: Final = 1e-12
-#: Part of the largest remainder: those that differ by less are equal but for rounding and a description's digits.
-_TIE_RATIO: Final = 1e-6
 
 
 def product(A: Array, B: Array) -> Array:
@@ -72,7 +70,8 @@ def pivoted(rows: Array, dependent: float = DEPENDENT) -> tuple[list[int], list[
         largest = float(norms.max())
         if not largest > dependent:
             break
-        k = int((norms >= (1 - _TIE_RATIO) * largest).argmax())
+        # Remainders that differ by less are equal but for rounding and a description's digits.
+        k = int((norms >= (1 - PRINTED) * largest).argmax())
         known = basis[: len(order)]
         unit = left[k] - (known @ left[k]) @ known
         unit /= math.sqrt(unit @ unit)

@@ -472,7 +472,7 @@ def test_of_a_batch_each_ends_at_its_own_event_beside_phases() -> None:
 
 
 def test_progress_of_phases_is_that_of_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mbkit.simulate.progress._PERIOD", 0.0)
+    monkeypatch.setattr("mbkit.simulate.progress.LOOK_SECONDS", 0.0)
     told: list[float] = []
     dyn = mb.dynamics(slider(friction=0.2), "lagrangian")
     run = mb.simulate(dyn, [[0.2], [0.1]], [0.0], 3.0, "rk853", save=[3.0], progress=told.append)

@@ -140,7 +140,7 @@ def test_a_run_is_interrupted_between_its_parts_and_does_not_depend_on_them(
     torque = np.sin(np.arange(100.0)[:, None] * [0.1, 0.2])
     runs = []
     for period in (0.0, 1e9):
-        monkeypatch.setattr("mbkit.engines.mujoco.engine._SIGNAL_PERIOD", period)
+        monkeypatch.setattr("mbkit.engines.mujoco.engine.LOOK_SECONDS", period)
         runs.append(simulate(dyn, *start, 0.1, method, torque=torque))
     assert np.array_equal(runs[0].q, runs[1].q)
     assert np.array_equal(runs[0].v, runs[1].v)
@@ -151,8 +151,8 @@ def test_a_run_is_interrupted_between_its_parts_and_does_not_depend_on_them(
         seen.append(fraction)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mbkit.engines.mujoco.engine._SIGNAL_PERIOD", 0.0)
-    monkeypatch.setattr("mbkit.simulate.progress._PERIOD", 0.0)
+    monkeypatch.setattr("mbkit.engines.mujoco.engine.LOOK_SECONDS", 0.0)
+    monkeypatch.setattr("mbkit.simulate.progress.LOOK_SECONDS", 0.0)
     with pytest.raises(KeyboardInterrupt):
         simulate(dyn, *start, 1.0, method, progress=interrupt)
     assert len(seen) == 1

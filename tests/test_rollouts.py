@@ -362,7 +362,7 @@ def test_a_model_that_cannot_move_says_who_is_to_blame() -> None:
 def test_progress_is_told_up_to_the_end(planar: LagrangianDynamics, monkeypatch: pytest.MonkeyPatch) -> None:
     q, v = start(planar, 40)
     monkeypatch.setattr(compiled_fixed_step, "_widest", lambda _: 8)
-    monkeypatch.setattr("mbkit.simulate.progress._PERIOD", 0.0)
+    monkeypatch.setattr("mbkit.simulate.progress.LOOK_SECONDS", 0.0)
     for threads in (1, 2):
         told: list[float] = []
         dyn = dynamics(planar.model, "lagrangian", compile=True, threads=threads)
@@ -382,7 +382,7 @@ def test_an_error_in_the_callers_function_stops_the_threads(
 
     q, v = start(planar, 40)
     monkeypatch.setattr(compiled_fixed_step, "_widest", lambda _: 8)
-    monkeypatch.setattr("mbkit.simulate.progress._PERIOD", 0.0)
+    monkeypatch.setattr("mbkit.simulate.progress.LOOK_SECONDS", 0.0)
     for threads in (1, 2):
         dyn = dynamics(planar.model, "lagrangian", compile=True, threads=threads)
         with pytest.raises(StopError):

@@ -554,7 +554,7 @@ def test_csv_holds_every_digit(tmp_path: Path) -> None:
 def test_progress_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     from mbkit.simulate import progress
 
-    monkeypatch.setattr(progress, "_PERIOD", 0.0)
+    monkeypatch.setattr(progress, "LOOK_SECONDS", 0.0)
     dyn = dynamics(catalog.pendulum())
     for method, save in (("rk4", None), ("dop853", [0.0, 0.5])):
         told: list[float] = []

@@ -22,7 +22,7 @@ from typing import Any, Final
 import casadi as ca
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import DOUBLE_BITS, Array
 from mbkit._process import fork_safe
 from mbkit.codegen.program import Operation, Program, program
 from mbkit.derivation.equations import Equations, kept
@@ -201,7 +201,7 @@ class TaylorSystem:
     def _compiled(self, kind: Precision, tolerance: float) -> Any:
         n = self._nq + self._nv
         # Beyond double the arithmetic itself takes so long that loops cost nothing.
-        compact = kind.bits > 53 or self.operations * order_of(tolerance) ** 2 > _MAX_UNROLLED_OPERATIONS
+        compact = kind.bits > DOUBLE_BITS or self.operations * order_of(tolerance) ** 2 > _MAX_UNROLLED_OPERATIONS
         with _COMPILING:
             return _heyoka().taylor_adaptive(
                 self._system,

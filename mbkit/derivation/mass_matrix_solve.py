@@ -14,13 +14,13 @@ from typing import Any, Final
 import casadi as ca
 import numpy as np
 
+from mbkit._check import TINY
 from mbkit._reproducible import DEPENDENT
 from mbkit.derivation.model_values import scalar
 from mbkit.model import Model
 
 #: Mass of a coordinate that has none, in terms of the mean one.
 _MASSLESS: Final = 1e-20
-_TINY: Final = 1e-300
 #: Later columns from which on a reflection onto a row of their own saves more than its root costs.
 _WORTH_A_ROOT: Final = 4
 
@@ -226,7 +226,7 @@ class ConstraintTerms:
         squares = self.jacobian**2
         heavy, light = ca.mtimes(squares, masses), ca.mtimes(squares, 1 / masses)
         # The term of a row without slope is zero.
-        return ca.sqrt((heavy + _TINY) / (light + _TINY)) / (ca.sum2(squares) + _TINY)
+        return ca.sqrt((heavy + TINY) / (light + TINY)) / (ca.sum2(squares) + TINY)
 
     def weight(self, M: Any) -> Any:
         """Return W = M + Jᵀ diag(s) J of `stiffening`."""

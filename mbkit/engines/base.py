@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._attributes import ReadOnly, single_values
-from mbkit._check import Array, all_finite, batch_of, rows
+from mbkit._check import DOUBLE_BITS, Array, all_finite, batch_of, rows
 from mbkit._process import fork_safe
 from mbkit.engines import constrained, loads
 from mbkit.engines.closed_loops.actuation import ACTUATOR_FORCES
@@ -65,8 +65,6 @@ _GATES: Final = {
     "actuator": ACTUATOR_FORCES,
     "motion": REDUCED_INERTIA,
 }
-#: Bits of a double's significand.
-DOUBLE_BITS: Final = 53
 #: Names in a list of an error message.
 MAX_NAMES: Final = 3
 

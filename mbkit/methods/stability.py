@@ -15,11 +15,8 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import ROUNDING, Array
 from mbkit.methods.tableaus import Tableau
-
-#: A coefficient of |D|² - |N|² below this part of the sum of its terms' sizes is rounding.
-_ROUNDING: Final = 1e-13
 
 
 class Stability(Protocol):
@@ -100,7 +97,7 @@ class TableauStability:
         # A coefficient may be a sum that cancels: its rounding is that of the terms.
         terms = sum(_padded(np.convolve(np.abs(x), np.abs(x)), length) for x in turned)
         gap = below - above
-        gap[np.abs(gap) <= _ROUNDING * terms] = 0.0
+        gap[np.abs(gap) <= ROUNDING * terms] = 0.0
         roots = np.roots(gap[::-1])
         edges = np.sort(roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 1e-9)].real)
         inside = 0.0

@@ -13,9 +13,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import EPS, ROUNDING, Array
+from mbkit._check import DOUBLE_BITS, EPS, ROUNDING, Array
 from mbkit.engines import Dynamics
-from mbkit.engines.base import DOUBLE_BITS, at_time
+from mbkit.engines.base import at_time
 from mbkit.engines.constrained import off_by
 from mbkit.errors import MbkitError
 from mbkit.methods.registry import ADAPTIVE_METHOD, AUTOMATIC_METHOD, SERIES_METHOD, Method, Tolerances

@@ -9,9 +9,8 @@ from typing import Final
 
 import numpy as np
 
-from mbkit._check import EPS, PRINTED, Array, batch_of, real
+from mbkit._check import DOUBLE_BITS, EPS, PRINTED, Array, batch_of, real
 from mbkit.engines import Dynamics
-from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.constrained import unwatched
 from mbkit.engines.frames_and_momenta import axes_named
 from mbkit.errors import FunctionError, InputError, MbkitWarning, UnsupportedError, warn
@@ -27,6 +26,7 @@ from mbkit.simulate.problem import RUNS, IntegrationProblem, RunRequest, Solver
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.run_data import Acting, RunData, RunSettings, SolverResult
 from mbkit.simulate.singular_poses import describe_poses
+from mbkit.simulate.solvers.in_phases.fixed import SIDE_BY_SIDE
 from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, Indices, check_room, save_times
 from mbkit.simulate.torque import RunWrenches, Torque, TorqueFunction
 
@@ -40,8 +40,6 @@ SMOOTH_RUNS: Final = Path(
 _MIN_RTOL_EXTENDED: Final = 1e-32
 #: Cost of an evaluation from Python, in evaluations in machine code.
 _COST_IN_PYTHON: Final = 40
-#: Number of evaluations in machine code that take the time of one in a batch.
-_SIDE_BY_SIDE: Final = 8
 
 
 #: The run of a problem in parts, of which each is solved by the solver of its dynamics.
@@ -125,7 +123,7 @@ def integrate(
         states = settings.with_start(outcome.t, outcome.q, outcome.v)
         compiled = chosen.kind == "native" or (_compiles(own) and not read.callable)
         work = max(outcome.steps, outcome.evaluations)
-        work = work // min(batch or 1, _SIDE_BY_SIDE) if compiled else work * _COST_IN_PYTHON
+        work = work // min(batch or 1, SIDE_BY_SIDE) if compiled else work * _COST_IN_PYTHON
         driven = applied is not None or model.driven_by_forces
         doubts += tuple(diagnostics(dyn, chosen, setting, states, driven=driven, steps=outcome.steps, work=work))
     message = outcome.message + ("" if outcome.last is None else massless_joints(dyn, outcome.last))

@@ -10,13 +10,12 @@ from typing import Any
 
 from mbkit import _process as _interrupt
 from mbkit._escape import one_line
+from mbkit._process import LOOK_SECONDS
 from mbkit.errors import InputError
 
 #: progress(fraction), from 0 to 1
 ProgressFunction = Callable[[float], object]
 
-#: Time between two reports, s.
-_PERIOD = 0.1
 #: Time before a bar appears, s.
 _PATIENCE = 2.0
 
@@ -75,7 +74,7 @@ class Progress:
         self._done = self._next = 0.0
 
     def __enter__(self) -> Progress:
-        self._next = time.perf_counter() + _PERIOD
+        self._next = time.perf_counter() + LOOK_SECONDS
         if self._bar is not None:
             self._bar.__enter__()
         return self
@@ -84,7 +83,7 @@ class Progress:
         """Report the fraction done, if it is time to."""
         self._done = fraction
         if self._report and (now := time.perf_counter()) >= self._next:
-            self._next = now + _PERIOD
+            self._next = now + LOOK_SECONDS
             self._report(fraction)
 
     def __exit__(self, kind: object, *_: object) -> None:

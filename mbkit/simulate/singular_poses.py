@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mbkit._check import CONSISTENT, EPS, Array
+from mbkit._check import CENTRAL_STEP, CONSISTENT, Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import MAX_NAMES, at_times
 from mbkit.engines.constrained import AT_POSE, AT_SINGULAR_POSE, TAKES_PART
@@ -33,9 +33,6 @@ LOOSEST: Final = 1e-10
 _ENDS: Final = 256
 #: Rest of γ at a velocity that stays on a branch to a loose run's digits, relative to its size at any velocity.
 _ON_BRANCH: Final = 1e-5
-#: Difference of times by which J's rate is found, relative to the motion's time scale: there truncation and rounding
-#: are alike.
-_APART: Final = EPS ** (1 / 3)
 
 
 def manifold_at(dyn: Dynamics, t: float) -> Manifold:
@@ -82,9 +79,9 @@ class Passage:
             return "at rest there each branch of its motion is as good as another"
         J1, J0 = (
             manifold.at(_known(dyn, self._t + side)).jacobian(dyn.model.integrate(q, side * v))
-            for side in (_APART / speed, -_APART / speed)
+            for side in (CENTRAL_STEP / speed, -CENTRAL_STEP / speed)
         )
-        turning = self._lost.T @ (J1 - J0) @ self._free / (2 * _APART)
+        turning = self._lost.T @ (J1 - J0) @ self._free / (2 * CENTRAL_STEP)
         if not np.linalg.svd(turning, compute_uv=False)[-1] > CONSISTENT:
             return "its velocity does not say on which branch it goes on"
         # γ is quadratic in v, and zero in these rows on a branch. Differences of any length are its derivative.
@@ -143,7 +140,7 @@ class Approach:
 def time_ahead(dyn: Dynamics, t: float, q: Array, v: Array) -> Array:
     """Return when J's smallest singular value will be zero at its present rate, s from now; 0 at a singular pose."""
     manifold = manifold_at(dyn, t)
-    apart = _APART / np.maximum(np.abs(v).max(axis=-1, keepdims=True), np.finfo(float).tiny)
+    apart = CENTRAL_STEP / np.maximum(np.abs(v).max(axis=-1, keepdims=True), np.finfo(float).tiny)
     J, beside = (manifold.jacobian(x) for x in (q, dyn.model.integrate(q, apart * v)))
     U, sizes, V = np.linalg.svd(np.where(np.isfinite(J), J, 0.0), full_matrices=False)
     # By the vectors, as the value itself turns round where it is zero.

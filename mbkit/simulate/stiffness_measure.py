@@ -18,7 +18,7 @@ from typing import Any, Final, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import EPS, Array, batch_of, finite_array, real
+from mbkit._check import CENTRAL_STEP, EPS, Array, batch_of, finite_array, real
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.base import at_time, no_dynamics
 from mbkit.engines.registry import DERIVED
@@ -30,10 +30,6 @@ from mbkit.model.manifold import tangent_maps, unit_quaternions
 from mbkit.simulate.torque import Force, TorqueCallback, TorqueFunction
 
 _TWIN: Final = "_derived_twin"
-#: Step of central differences in q, at which truncation and rounding are alike for a function of its own size.
-_Q_DIFFERENCE: Final = EPS ** (1 / 3)
-#: Step of central differences in v, wide for the digits: accelerations are of second order in v, and so exact.
-_V_DIFFERENCE: Final = 1e-4
 #: Smallest Re λ over |λ| of a motion that grows rather than oscillates.
 _MIN_GROWTH_SHARE: Final = 0.1
 #: Smallest rate that is shown, relative to the fastest.
@@ -150,8 +146,9 @@ def _twin(dyn: Dynamics) -> Dynamics:
 def linearized(space: Space, q: Array, w: Array, rates: Callable[[Array, Array], Array]) -> Array:
     """Return J by central differences, (2 nv, 2 nv); w is the integrators' own velocity, rates(q, w) is ẇ of rows."""
     nv = space.nv
-    length = _Q_DIFFERENCE * np.maximum(1.0, np.abs(space.magnitude(q, w)))
-    speed = np.full(nv, _V_DIFFERENCE * max(1.0, float(np.abs(w).max(initial=0.0))))
+    length = CENTRAL_STEP * np.maximum(1.0, np.abs(space.magnitude(q, w)))
+    # Wide for the digits: accelerations are of second order in v, and so exact.
+    speed = np.full(nv, 1e-4 * max(1.0, float(np.abs(w).max(initial=0.0))))
     changes = np.diag(np.concatenate([length, speed]))
     both = np.concatenate([changes, -changes])
     u, there = both[:, :nv], w + both[:, nv:]

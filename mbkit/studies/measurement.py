@@ -9,9 +9,8 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from mbkit._check import EPS, Array
+from mbkit._check import DOUBLE_BITS, EPS, Array
 from mbkit.engines import Dynamics
-from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import MbkitError
 from mbkit.model import Model

@@ -46,6 +46,7 @@ from typing import Any, Final
 
 import casadi as ca
 
+from mbkit._check import BOUND
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.mass_matrix_solve import solve
 from mbkit.derivation.steps.fixed import Part, at_time, function_of
@@ -61,8 +62,6 @@ MAX_LAST_CORRECTION: Final = 1e-8
 MAX_LAST_MOVE: Final = 1e-12
 #: Most iterations of Newton's method in a step: one that has not converged by then wanders about.
 MAX_NEWTON_ITERATIONS: Final = 12
-#: Sum of squares of a state that counts as diverged, 1e100 squared.
-_RUNAWAY: Final = 1e200
 
 
 class _MomentumSpace(SymbolicSpace):
@@ -265,7 +264,7 @@ def is_last(change: Any, w: Any, q: Any, h: Any) -> Any:
 
 def is_lost(q: Any, pi: Any) -> Any:
     """Return 1 where a state is beyond all bounds, else 0."""
-    return 1 - (ca.sumsqr(q) + ca.sumsqr(pi) < _RUNAWAY)
+    return 1 - (ca.sumsqr(q) + ca.sumsqr(pi) < BOUND**2)
 
 
 #: Slope of a row without one, and mass along one that moves links without mass alone.

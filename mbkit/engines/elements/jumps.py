@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mbkit._check import Array
+from mbkit._check import DOUBLE_BITS, Array
 from mbkit._reproducible import unit_rows
 from mbkit.engines.elements.passive import LOADS, UNDER_FORCE, AddedForce
 from mbkit.errors import MbkitWarning, NumericalError, UnsupportedError, warn
@@ -34,7 +34,6 @@ Mask = NDArray[np.bool_]
 #: Phases that dynamics keep.
 _MAX_KEPT_PHASES: Final = 256
 _FORWARD: Final = "forward_dynamics"
-_DOUBLE_SIGNIFICAND_BITS: Final = 53
 #: Rounds of exchanges, at most; a nearly singular A takes more than two proximal points.
 _MAX_ROUNDS: Final = 20_000
 #: Joints with friction whose rounds are machine code: 2 s are spent on 18 of them, and 9 s on 24.
@@ -127,7 +126,7 @@ class Jumps(AddedForce):
                 resting = law.at_rest(v)
                 if not resting.any():
                     return moving(q, v, tau, *rest)
-                if dyn._significand_bits > _DOUBLE_SIGNIFICAND_BITS:
+                if dyn._significand_bits > DOUBLE_BITS:
                     return self._in_phase(quantity, dyn, q, v, tau, rest, resting)
                 held, still = self._each(dyn, quantity, moving, q, v, tau, rest, resting)
                 out = moving(q, v, tau + padded(held, tau), *rest)

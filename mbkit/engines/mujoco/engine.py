@@ -26,6 +26,7 @@ from mbkit import spatial
 from mbkit._attributes import single_values
 from mbkit._check import Array, batch_of, count, real, shown
 from mbkit._child_process import cores
+from mbkit._process import LOOK_SECONDS
 from mbkit.engines import known_defects
 from mbkit.engines.base import MappedDynamics
 from mbkit.engines.closed_loops.rows_of_frames import RowsOfFrames
@@ -73,8 +74,6 @@ INTEGRATORS: Final = {
 _STATE: Final = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _SINGULAR: Final = int(mujoco.mjtWarning.mjWARN_INERTIA)
 _FORCE: Final = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
-# MuJoCo's code cannot be interrupted: it is left this often, s, for signals and progress. States do not depend on it.
-_SIGNAL_PERIOD: Final = 0.1
 
 
 def rollout(
@@ -133,7 +132,8 @@ def _run(
             m, data, first, part, control_spec=_FORCE, nstep=end - done, skip_checks=False
         )
         seconds = time.perf_counter() - started
-        count = max(1, int(count * min(16.0, _SIGNAL_PERIOD / max(seconds, 1e-6))))
+        # MuJoCo's code cannot be interrupted: it is left for signals and progress. States do not depend on it.
+        count = max(1, int(count * min(16.0, LOOK_SECONDS / max(seconds, 1e-6))))
         done = end
         if progress is not None:
             progress(done / steps)

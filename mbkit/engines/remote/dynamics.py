@@ -17,6 +17,7 @@ import numpy as np
 from mbkit import spatial
 from mbkit._attributes import forwarded
 from mbkit._check import Array
+from mbkit._process import LOOK_SECONDS
 from mbkit.engines import known_defects
 from mbkit.engines.base import MappedDynamics, applied
 from mbkit.engines.elements.passive import JointPassive, pull
@@ -36,8 +37,7 @@ _REFUSED: Final = {
 }
 
 
-#: A run by the engine's own integrator is left this often, s, for signals and progress; after so many steps first.
-_SIGNAL_PERIOD: Final = 0.1
+#: A run by the engine's own integrator is left for signals and progress; after so many steps first.
 _FIRST_STEPS: Final = 16
 
 
@@ -313,7 +313,7 @@ class VersionDynamics(MappedDynamics):
                 raise UnsupportedError(str(error)) from None
             parts.append((xs[..., 1:, :], us[..., 1:, :]))
             # The first call may have compiled the step.
-            count = max(_FIRST_STEPS, int(count * min(16.0, _SIGNAL_PERIOD / (time.perf_counter() - begun))))
+            count = max(_FIRST_STEPS, int(count * min(16.0, LOOK_SECONDS / (time.perf_counter() - begun))))
             x, u, done = xs[..., -1, :], us[..., -1, :], end
             progress(done / steps)
         xs, us = (np.concatenate(one, axis=-2) for one in zip(*parts, strict=True))

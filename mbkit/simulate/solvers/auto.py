@@ -18,6 +18,7 @@ from typing import Final
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.engines.base import MAX_NAMES
 from mbkit.errors import FunctionError, NumericalError
 from mbkit.methods.registry import ADAPTIVE_METHOD, SERIES_METHOD, STIFF_METHOD, Tolerances
 from mbkit.model.integration_space import Space
@@ -54,8 +55,6 @@ _NOISE_PLACES: Final = np.linspace(0.0, 1.0, 12)[:, None]
 _CUBIC: Final = np.linalg.qr(_NOISE_PLACES ** np.arange(4))[0]
 _CUBIC_RESIDUAL: Final = np.eye(len(_NOISE_PLACES)) - _CUBIC @ _CUBIC.T
 _RESIDUAL_FREEDOM: Final = len(_NOISE_PLACES) - 4
-#: Number of sequences of methods in a batch that are described.
-_MAX_DESCRIBED: Final = 3
 #: Largest rounding of accelerations times a step, in tolerances; rk853's weights make an error twice as large of it.
 _MAX_NOISE: Final = 0.015
 #: Cost of a check, in steps of rk853: so many come before the first. Measured by validation/auto.py in processor
@@ -426,11 +425,11 @@ def _chosen(controllers: Sequence[SwitchingController], batch: int | None) -> st
         return controllers[0].describe()
     sequences = [controller.method_sequence() for controller in controllers]
     kinds, parts = Counter(sequences), list[str]()
-    for kind, count in kinds.most_common(_MAX_DESCRIBED):
+    for kind, count in kinds.most_common(MAX_NAMES):
         example = sequences.index(kind)
         text = controllers[example].describe()
         such = "" if text == kind else f", such as trajectory {example}"
         parts.append(f"{count} of {batch}{such}: {text}")
-    if len(kinds) > _MAX_DESCRIBED:
-        parts.append(f"and {len(kinds) - _MAX_DESCRIBED} more kinds")
+    if len(kinds) > MAX_NAMES:
+        parts.append(f"and {len(kinds) - MAX_NAMES} more kinds")
     return "; ".join(parts)

@@ -17,8 +17,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mbkit._check import Array
+from mbkit._check import BOUND, Array
 from mbkit._child_process import cores
+from mbkit._process import LOOK_SECONDS
 from mbkit.codegen.compiled import Call, KernelSequence
 from mbkit.codegen.compiled_calls import Plan
 from mbkit.codegen.cuda.driver import in_parts
@@ -43,13 +44,9 @@ from mbkit.simulate.solvers.machine_code_blocks import (
     run_members,
 )
 from mbkit.simulate.solvers.trajectory_record import GridRecord
-from mbkit.simulate.solvers.vector_field import BOUND, are_bounded
+from mbkit.simulate.solvers.vector_field import are_bounded
 from mbkit.simulate.time_grid import Indices
 
-#: Number of steps of the first launch.
-_FIRST_LAUNCH_STEPS: Final = 8
-#: Launches take twice as many steps until one lasts so long, s, so that Ctrl-C is heard.
-_LAUNCH_SECONDS: Final = 0.1
 #: Bytes of held torques that go to the GPU at once.
 _MAX_TORQUE_BYTES: Final = 2**28
 
@@ -94,7 +91,8 @@ def _run(
     arena.put("parameters", values[members].T if values.ndim == 2 else values[:, None])
     # The last step may have a length of its own.
     stops = {*record.kept.tolist(), grid.steps - 1 if grid.last != grid.dt else grid.steps, grid.steps} - {0}
-    k, most, dt = 0, _FIRST_LAUNCH_STEPS, np.nan
+    # Launches take twice as many steps until one lasts so long that Ctrl-C would have to wait.
+    k, most, dt = 0, 8, np.nan
     for stop in sorted(stops):
         while k < stop:
             if grid.step(k) != dt:
@@ -106,7 +104,7 @@ def _run(
                 count = max(1, min(count, _MAX_TORQUE_BYTES // max(force[0].nbytes, 1)))
             began = time.perf_counter()
             arena.take_steps(count, force[:count])
-            if time.perf_counter() - began < _LAUNCH_SECONDS:
+            if time.perf_counter() - began < LOOK_SECONDS:
                 most *= 2
             k += count
             problem.bar.update(done + (end - done) * k / grid.steps)

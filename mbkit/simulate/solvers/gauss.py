@@ -15,15 +15,15 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from mbkit._check import EPS, Array
+from mbkit.engines.steps import MAX_NEWTON_ITERATIONS
 from mbkit.methods.tableaus import ImplicitTableau, extrapolation_weights, gauss_legendre
 from mbkit.model.integration_space import Space
 from mbkit.simulate.singular_poses import time_ahead, undetermined
 from mbkit.simulate.solvers.vector_field import DIVERGED, DivergenceError, Field
 from mbkit.simulate.torque import Force
 
-#: Most iterations of a step with one matrix at most, and with the matrix of every iterate.
-_MAX_ITERATIONS: Final = 60
-_MAX_NEWTON_ITERATIONS: Final = 25
+#: Most iterations of a step that converge linearly: with one matrix at most, or under a torque function.
+MAX_ITERATIONS: Final = 60
 #: Largest ratio of a correction to the last one with which an iteration goes on. Beyond it plain iteration gives way to
 #: Newton's, and Newton's matrix to a new one.
 _MAX_CONTRACTION: Final = 0.05
@@ -118,7 +118,7 @@ class CollocationStep:
     def _iterated(self, start: _Start, guess: Array, inverse: Array | None) -> tuple[Array, Array | None]:
         unknown = np.full(start.w.shape[:-1], np.inf)
         rates, last, fresh = guess, unknown, False
-        for _ in range(_MAX_ITERATIONS):
+        for _ in range(MAX_ITERATIONS):
             try:
                 change = self._mapped(start, rates) - rates
             except DivergenceError:
@@ -144,7 +144,7 @@ class CollocationStep:
     def _newton(self, start: _Start, rates: Array) -> Array:
         """Return the rates by Newton's method proper."""
         last = np.full(start.w.shape[:-1], np.inf)
-        for _ in range(_MAX_NEWTON_ITERATIONS):
+        for _ in range(MAX_NEWTON_ITERATIONS):
             change = self._mapped(start, rates) - rates
             stages = zip(self._times, *self._stages(start, rates), strict=True)
             J = np.stack([self._slopes(start, c, u, w) for c, u, w in stages])

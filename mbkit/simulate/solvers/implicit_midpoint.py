@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mbkit._check import EPS, Array
+from mbkit._check import BOUND, EPS, PIECE_SIZE, Array
 from mbkit.codegen.backend import Machine
 from mbkit.derivation.mass_matrix_solve import factors_written_out
 from mbkit.derivation.steps.fixed import Part
@@ -32,19 +32,15 @@ from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.run_data import SolverResult
 from mbkit.simulate.singular_poses import SingularPosesOfBatch
 from mbkit.simulate.solvers.fixed_step import STAGES_NEAR_POSE, SteppedRun, Stepper
-from mbkit.simulate.solvers.gauss import StepNearPose
+from mbkit.simulate.solvers.gauss import MAX_ITERATIONS, StepNearPose
 from mbkit.simulate.solvers.trajectory_record import GridRecord
-from mbkit.simulate.solvers.vector_field import BOUND, DIVERGED, DivergenceError, Field, are_bounded
+from mbkit.simulate.solvers.vector_field import DIVERGED, DivergenceError, Field, are_bounded
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
 
 _OTHERS: Final = f"{IMPLICIT_METHODS} are the implicit methods for it"
 SYMPLECTIC: Final = Path("symplectic runs", "implicit_midpoint: no form is kept of", ALL - {"speed"}, instead=_OTHERS)
-#: Most iterations of a step under a torque function, with which they converge linearly.
-_MAX_ITERATIONS_WITH_FUNCTION: Final = 60
 _UNSOLVED: Final = "Newton's iteration does not solve the step's equations"
-#: Count of momenta that are turned into velocities at a time.
-_MAX_MOMENTA: Final = 2**16
 
 
 def run_midpoint(problem: IntegrationProblem) -> SolverResult:
@@ -212,7 +208,7 @@ class MidpointStepper(Stepper):
         if isinstance(force, np.ndarray):
             tau[:] = force
         last, todo = np.full(len(q), np.inf), np.arange(len(q))
-        for _ in range(MAX_NEWTON_ITERATIONS if isinstance(force, np.ndarray) else _MAX_ITERATIONS_WITH_FUNCTION):
+        for _ in range(MAX_NEWTON_ITERATIONS if isinstance(force, np.ndarray) else MAX_ITERATIONS):
             # Never call the user's function with a non-finite state.
             todo = todo[np.isfinite(w[todo]).all(axis=1) & ~good[todo]]
             if not len(todo):
@@ -260,7 +256,7 @@ def _to_velocities(
     """Turn the kept momenta into velocities."""
     kept, (n, rows, nv) = record.kept, record.v.shape
     times = problem.grid.times_of(kept)
-    size = max(_MAX_MOMENTA // max(n * (nv or 1), 1), 1)
+    size = max(PIECE_SIZE // max(n * (nv or 1), 1), 1)
     for start in range(0, rows, size):
         q, v = (x[:, start : start + size] for x in (record.q, record.v))
         at_k = kept[start : start + size]

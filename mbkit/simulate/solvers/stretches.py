@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import ROUNDING, Array
 from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError, NumericalError
 from mbkit.simulate.events import Event, Hit
@@ -25,8 +25,6 @@ from mbkit.simulate.torque import Torque
 
 #: Most stretches in a row that end where they begin.
 MAX_EMPTY: Final = 20
-#: Largest length of one of these, relative to the run's times.
-_NO_TIME: Final = 1e-12
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -127,7 +125,7 @@ def _to_end(
         t, q, v = (t, q[-1], v[-1]) if last is None else (last.t, last.q, last.v)
         record.reached = t
         problem.report(i)(t)
-        moved = t - begun > _NO_TIME * max(abs(begun), problem.duration)
+        moved = t - begun > ROUNDING * max(abs(begun), problem.duration)
         empty, follow, stretch = 0 if moved else empty + 1, stretch.follow, None
         if empty > MAX_EMPTY:
             return False

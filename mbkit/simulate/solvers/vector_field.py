@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._attributes import forwarded
-from mbkit._check import Array
+from mbkit._check import BOUND, Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
 from mbkit.errors import InputError, NumericalError
@@ -20,8 +20,6 @@ from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
 
 DIVERGED: Final = "the state grew beyond all bounds"
-#: A state with a number of this size has diverged: no machine goes there, and energies below can still be computed.
-BOUND: Final = 1e100
 #: An engine overflows before its state does, and blames the model: from this size on its reason does not count.
 BLAMELESS: Final = 1e50
 ALL: Final = np.array(True)

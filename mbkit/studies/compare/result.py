@@ -10,8 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from mbkit._check import by_key
-from mbkit.engines.base import DOUBLE_BITS
+from mbkit._check import DOUBLE_BITS, by_key
 from mbkit.engines.constrained import off_by
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.simulate.plotting.style import drawing

@@ -21,9 +21,8 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit import spatial
-from mbkit._check import EPS, Array, count, real
+from mbkit._check import DOUBLE_BITS, EPS, Array, count, real
 from mbkit.engines import Dynamics, dynamics
-from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.registry import DERIVED, STANDARD, find_engine
 from mbkit.errors import KnownDefectWarning, MbkitError, NumericalError, UnsupportedError

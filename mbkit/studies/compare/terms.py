@@ -13,9 +13,8 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import DOUBLE_BITS, Array
 from mbkit.engines import Dynamics
-from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.frames_and_momenta import LOCAL
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import UnsupportedError

@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mbkit import spatial
-from mbkit._check import Array
+from mbkit._check import TINY, Array
 from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import KnownDefectWarning, MbkitError, UnsupportedError
 from mbkit.load.shapes import NOTHING, MassProperties
@@ -28,7 +28,7 @@ from mbkit.studies.explain import terms
 from mbkit.studies.explain.hypotheses import absences, body_mistakes, joint_mistakes
 from mbkit.studies.explain.merged_model import MergedModel, merge, number_text
 from mbkit.studies.explain.result import Cause, Explanation
-from mbkit.studies.explain.terms import TERM, TINY, Gaps, Values, evaluated, gaps, larger, model_terms, worst
+from mbkit.studies.explain.terms import TERM, Gaps, Values, evaluated, gaps, larger, model_terms, worst
 
 #: The field that adds to T along a rate.
 _ROTOR: Final = JointCoupling.adding_to("T")[0]

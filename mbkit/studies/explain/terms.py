@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import PRINTED, Array
+from mbkit._check import PRINTED, TINY, Array
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import (
@@ -38,8 +38,6 @@ from mbkit.studies.explain.merged_model import OTHERS
 TERM: Final = {term.name: term for term in terms.TERMS}
 #: Terms of each explanation.
 TERMS: Final = ("M", "g", "nle", "passive")
-#: Least size by which a force is divided.
-TINY: Final = 1e-300
 #: The term of two whole systems, with their constraints and all forces.
 WHOLE: Final = "accelerations"
 Values = dict[str, Array]

@@ -22,10 +22,9 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
-from mbkit._check import Array, count, real
+from mbkit._check import DOUBLE_BITS, Array, count, real
 from mbkit._child_process import WorkerDiedError, WorkerTimeoutError
 from mbkit._process import fork_safe
-from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.imported import IMPORTERS, Imported, Importer, check_installed, reader
 from mbkit.engines.remote import dynamics as remote_importer
 from mbkit.engines.remote.packages import EngineVersion, names_version

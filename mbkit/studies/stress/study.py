@@ -24,6 +24,7 @@ from mbkit._child_process import (
     WorkerTimeoutError,
     cores,
 )
+from mbkit._process import LOOK_SECONDS
 from mbkit.engines.registry import DERIVED, INDEPENDENT, find_engine
 from mbkit.errors import InputError
 from mbkit.methods.registry import METHODS
@@ -43,8 +44,6 @@ _WORKER_BYTES: Final = 2 * 2**30
 #: Below it no worker starts, bytes.
 _MIN_WORKER_BYTES: Final = 2**29
 _MAX_JOBS: Final = 16
-#: Seconds between two looks at how far the study is.
-_LOOK_SECONDS: Final = 0.2
 #: A run is not begun with less time than this, s.
 _MIN_RUN_SECONDS: Final = 0.1
 #: A row is over after so many runs in a row that did not finish.
@@ -295,7 +294,7 @@ def run_sweeps(sweeps: Sequence[CaseSweep], home: Path, memory: int, jobs: int, 
                 running[pool.lend(task.work, until)] = task
             if not running:
                 return
-            for future in wait(running, _LOOK_SECONDS, FIRST_COMPLETED).done:
+            for future in wait(running, LOOK_SECONDS, FIRST_COMPLETED).done:
                 task = running.pop(future)
                 task.state = "done" if future.result() or time.perf_counter() >= deadline else "waiting"
             yield

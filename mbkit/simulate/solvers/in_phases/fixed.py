@@ -31,12 +31,12 @@ from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.time_grid import Grid, Indices
 
 UNDECIDED: Final = "stopped, as which joints rest cannot be decided"
-#: Steps of a block, at least, and the factor by which blocks grow.
-_BLOCK, _GROWTH = 32, 4
+#: Steps of a block, at least.
+_BLOCK: Final = 32
 #: Steps of states in the time of a block's set-up and of its changes, by machine code and in Python.
 _SET_UP: Final = {True: 2**13, False: 2**5}
 #: States side by side that machine code steps in the time of one.
-_LANES: Final = 8
+SIDE_BY_SIDE: Final = 8
 #: States of a block, at most.
 _MOST_STATES: Final = 2**16
 #: Fraction of a step before which the end of a phase is not searched.
@@ -233,7 +233,7 @@ class _Members:
             times: Any = start + np.arange(1, q.shape[1]) * h
             margins = self._margins_of(phase, times, q[0, 1:], v[0, 1:])
         good = self._good(rows, phase, q, v, margins, limit, start, h)
-        self._ends = float((good < limit).sum() / max(good.sum(), 1)), n * _GROWTH
+        self._ends = float((good < limit).sum() / max(good.sum(), 1)), 4 * n
         last = np.arange(len(rows)), good
         if phase.still.any() and not (compiled and self.side_by_side):
             # What rests keeps its place and no velocity, to the bit.
@@ -266,7 +266,7 @@ class _Members:
     def _window(self, count: int) -> int:
         """Return the steps of a block: longer ones are set up less often, but steps behind ends are in vain."""
         compiled, (rate, most) = self._compiled(self._phase.dyn), self._ends
-        together = max(count, _LANES) if compiled else count
+        together = max(count, SIDE_BY_SIDE) if compiled else count
         best = np.sqrt(2 * _SET_UP[compiled] / (rate * together)) if rate else np.inf
         return int(np.clip(best, _BLOCK, most))
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mbkit._check import Array
+from mbkit._check import BOUND, Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
 from mbkit.engines.elements.jumps import jump_forces
@@ -30,7 +30,6 @@ from mbkit.simulate.torque import Force
 #: Attempts at once, and the most for one step for each velocity with a force that jumps.
 _ROUNDS: Final = 512
 _PATIENCE: Final = 40
-_RUNAWAY: Final = 1e100
 #: Responses of velocities to forces at rest, beside constraints, beyond which compiling a step takes longer than ten
 #: thousand steps in Python: 16 s for a delta robot with friction at 21 joints.
 _MAX_RESPONSES: Final = 200
@@ -218,7 +217,7 @@ class _Compiled:
         good = np.flatnonzero(np.diff(np.append(float(k), reached)) > 0)
         q, w = states[good][:, self._at["q"]], states[good][:, self._at["w"]]
         with np.errstate(invalid="ignore"):
-            fine = (np.abs(q).max(axis=1, initial=0) < _RUNAWAY) & (np.abs(w).max(axis=1, initial=0) < _RUNAWAY)
+            fine = (np.abs(q).max(axis=1, initial=0) < BOUND) & (np.abs(w).max(axis=1, initial=0) < BOUND)
         made, why = len(good), ""
         if not fine.all():
             made, why = int(np.argmin(fine)), DIVERGED
