@@ -43,9 +43,10 @@ CENTRAL_STEP: Final = EPS ** (1 / 3)
 PROBES: Final = 4
 #: Imaginary step of derivatives that are right to rounding.
 COMPLEX_STEP: Final = 1e-30
-_MAX_SUMMED: Final = 64
 #: Numbers of a piece of an array that is checked, copied or computed in pieces.
 PIECE_SIZE: Final = 2**16
+#: Lines of a list in a message or on a first screen: people act on the first few, and the data has the rest.
+MAX_LINES: Final = 8
 _SHORT: Final = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 3, 60, 120, 60
 
@@ -77,7 +78,7 @@ def all_finite(array: Array) -> bool:
     """Return whether an array holds only finite numbers."""
     # A plain sum of few numbers is several times cheaper than isfinite; huge finite ones
     # overflow it and are checked again.
-    if array.size <= _MAX_SUMMED and math.isfinite(sum(array.ravel().tolist())):
+    if array.size <= 64 and math.isfinite(sum(array.ravel().tolist())):
         return True
     return bool(np.isfinite(array).all())
 

@@ -35,12 +35,10 @@ from mbkit.errors import UnsupportedError
 OUT_OF_MEMORY: Final = "it took more memory than allowed"
 #: Wall-clock limit as a multiple of the CPU limit.
 _WALL_SECONDS_PER_CPU_SECOND: Final = 4.0
-#: The longest and the shortest time between two looks at a process, s.
-_LONGEST_WAIT, _SHORTEST_WAIT = 3600.0, 0.05
+#: Seconds until a process has started, and loaded its libraries.
+START_SECONDS: Final = 120.0
 #: Seconds that may pass between two parts of a message.
 _MAX_SILENT_SECONDS: Final = 60.0
-#: Characters of a process's output that are read after it died, and of its last line.
-_TAIL, _LAST = 20_000, 300
 
 
 def cores() -> int:
@@ -172,14 +170,15 @@ class Child:
             # `Connection.poll` makes such an object each time.
             coming = select.poll()
             coming.register(self._channel, select.POLLIN)
-            while not coming.poll(1e3 * min(max(0.0, min(end, last) - time.perf_counter()), _LONGEST_WAIT)):
+            # A poll knows no endless time: it is repeated each hour.
+            while not coming.poll(1e3 * min(max(0.0, min(end, last) - time.perf_counter()), 3600.0)):
                 if time.perf_counter() < min(end, last):
                     continue
                 # On a busy machine the process may not have had its processor time.
                 missing = seconds - (_processor_seconds(self._process.pid) - spent)
                 if missing <= 0 or end >= last:
                     raise TimeoutError
-                end = time.perf_counter() + max(missing, _SHORTEST_WAIT)
+                end = time.perf_counter() + max(missing, 0.05)
             return self._channel.recv_bytes()
         except (TimeoutError, BlockingIOError):
             self.end()
@@ -197,7 +196,7 @@ class Child:
         with contextlib.suppress(subprocess.TimeoutExpired):
             code = self._process.wait(timeout=5.0)
         with contextlib.suppress(OSError):
-            output = Path(self._output).read_bytes()[self._output_before :][-_TAIL:]
+            output = Path(self._output).read_bytes()[self._output_before :][-20_000:]
         self.end()
         return WorkerClosedError() if self._closed.is_set() else _death(code, output.decode("utf-8", "replace"))
 
@@ -269,7 +268,7 @@ def _processor_seconds(pid: int) -> float:
 
 def _death(code: int | None, output: str) -> WorkerDiedError:
     """Return how a process ended, from its status and its output."""
-    lines = [line[:_LAST] for text in output.splitlines() if (line := " ".join(text.split()))]
+    lines = [line[:300] for text in output.splitlines() if (line := " ".join(text.split()))]
     ended, name = f"ended with status {code}", ""
     if code is None:
         ended = "gave up the connection"

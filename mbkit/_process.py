@@ -186,8 +186,6 @@ ending = _Ending()
 
 _LOCKS: Final[WeakValueDictionary[int, Any]] = WeakValueDictionary()
 _NUMBERS: Final = count()
-#: Time of the first wait for a lock, s.
-_FIRST_WAIT_SECONDS: Final = 0.02
 _TAKEN: Final[list[list[Any]]] = []
 
 
@@ -203,7 +201,7 @@ def _take() -> None:
     It waits for the first as long as that takes, holding none, and for each other one for a while: two threads that
     wait for each other part then. The while doubles, as some work takes long.
     """
-    locks, busy, patience = list(_LOCKS.values()), 0, _FIRST_WAIT_SECONDS
+    locks, busy, patience = list(_LOCKS.values()), 0, 0.02
     while True:
         locks = [*locks[busy:], *locks[:busy]]
         times = (-1.0, *[patience] * (len(locks) - 1))

@@ -12,6 +12,7 @@ from dataclasses import replace
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
+from mbkit._check import MAX_LINES
 from mbkit.engines.registry import STANDARD, find_engine
 from mbkit.errors import InputError
 
@@ -26,8 +27,6 @@ __all__ = ["STRICT", "assert_baseline", "assert_engines_agree", "assert_plausibl
 
 #: Set to 1, an engine that is not installed fails a test instead of being skipped.
 STRICT = "MBKIT_TEST_STRICT"
-#: Lines of a list in a message: people act on the first few.
-_MAX_LISTED_LINES = 8
 
 
 def assert_engines_agree(
@@ -81,7 +80,7 @@ def assert_engines_agree(
         raise unittest.SkipTest(message)
     result = compare(model, present if missing else engines, samples, seed, tolerance=rtol, terms_only=True)
     if not result.passed or any(not r.term for r in result.refusals):
-        lines = [to_text(result.document(full=False), _MAX_LISTED_LINES)]
+        lines = [to_text(result.document(full=False), MAX_LINES)]
         if worst := result.worst:
             lines.append(f"  worst state ({worst.worst_kind}): q = {list(worst.worst_q)}, v = {list(worst.worst_v)}")
         packages = ((e, find_engine(e).distribution) for e in result.engines)
@@ -128,7 +127,7 @@ def assert_same_dynamics(
     names = (model_a.name, model_b.name) if model_a.name != model_b.name else ("model_a", "model_b")
     result = explain(model_a, model_b, samples=samples, seed=seed, tolerance=rtol, names=names)
     if not result.agree:
-        raise AssertionError(to_text(result.document(), _MAX_LISTED_LINES))
+        raise AssertionError(to_text(result.document(), MAX_LINES))
     return result
 
 
@@ -171,7 +170,7 @@ def assert_plausible(
 
     wrong = [row for row in result.rows if row.confidence != LOOK and not known(row)]
     if wrong:
-        raise AssertionError(to_text(replace(result, rows=tuple(wrong)).document(), _MAX_LISTED_LINES))
+        raise AssertionError(to_text(replace(result, rows=tuple(wrong)).document(), MAX_LINES))
     return result
 
 

@@ -223,7 +223,6 @@ done:
 _FAR: Final = "{ double, double, i64 }"
 #: Words of 64 bits of 2/π that the largest double asks for, behind one of zeros.
 _TWO_OVER_PI_WORDS: Final = 20
-_ZERO_BITS: Final = 64
 
 
 def _two_over_pi() -> list[int]:
@@ -261,8 +260,8 @@ def _far() -> str:
     bits = op("bitcast double %x to i64")
     e = op(f"and i64 {op(f'lshr i64 {bits}, 52')}, 2047")
     m = op(f"or i64 {op(f'and i64 {bits}, {2**52 - 1}')}, {2**52}")
-    # e - 1075 is the exponent of m; from the bit behind that of weight 4 on, and behind the zeros.
-    start = op(f"add i64 {e}, {_ZERO_BITS - 2 - 1075}")
+    # e - 1075 is the exponent of m; from the bit behind that of weight 4 on, and behind the 64 zeros.
+    start = op(f"add i64 {e}, {64 - 2 - 1075}")
     # Neighbours in a vector may be small.
     start = op(f"call i64 @llvm.smax.i64(i64 {start}, i64 0)")
     word, shift = op(f"lshr i64 {start}, 6"), op(f"and i64 {start}, 63")

@@ -46,10 +46,6 @@ _SAME: Final = (
     *("sqrt", "sin", "cos", "tan", "asin", "acos", "atan", "atan2"),
     *("exp", "expm1", "log", "log1p", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
 )
-#: heyoka's default limit of the machine code that it keeps in memory, bytes, and the one that replaces it:
-#: enough for some hundred systems.
-_HEYOKA_CODE_BYTES: Final = 2**31
-_MAX_CODE_BYTES: Final = 2**26
 #: heyoka's compiler has locks of its own, which a forked child must not find held.
 _COMPILING: Final = fork_safe(threading.RLock())
 _REMEDY: Final = "method='rk853' and method='dop853' go without it"
@@ -103,8 +99,9 @@ def _heyoka() -> Any:
             "taylor: heyoka is not installed; pip install heyoka (Linux), or conda install -c conda-forge heyoka.py; "
             + _REMEDY
         ) from None
-    if heyoka.llvm_state.get_memcache_limit() == _HEYOKA_CODE_BYTES:
-        heyoka.llvm_state.set_memcache_limit(_MAX_CODE_BYTES)
+    # heyoka keeps 2 GiB of machine code in memory unless somebody says otherwise; this is enough for a hundred systems.
+    if heyoka.llvm_state.get_memcache_limit() == 2**31:
+        heyoka.llvm_state.set_memcache_limit(2**26)
     return heyoka
 
 

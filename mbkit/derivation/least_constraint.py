@@ -221,7 +221,7 @@ _SINGULAR: Final = 1e26
 _STATES: Final = 8
 #: The poses tried along one velocity, over a reach that shrinks from a half turn to the last one.
 _GRID: Final = np.linspace(-1.0, 1.0, 9)
-_SHRINK, _LAST_REACH = 0.3, 1e-4
+_LAST_REACH: Final = 1e-4
 
 
 @lru_cache(maxsize=64)
@@ -266,7 +266,7 @@ def cancellation(model: Model, enough: float = np.inf) -> float:
             ratios = np.append(ratios, _ratios(model, poses[-1:]))
             if ratios.max() > worst:
                 worst, q = float(ratios.max()), poses[np.argmax(ratios)]
-            reach *= _SHRINK
+            reach *= 0.3
     return worst
 
 

@@ -20,7 +20,7 @@ from mbkit.engines.evaluation import Evaluation
 from mbkit.engines.frames_and_momenta import ALIGNED, axes_named
 from mbkit.engines.loads import Wrenches
 from mbkit.errors import InputError, NumericalError, UnsupportedError
-from mbkit.methods.one_step import SemiImplicitEuler
+from mbkit.methods.one_step import MAX_NEWTON_ITERATIONS, SemiImplicitEuler
 from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method, explicit_method, method_of
 from mbkit.methods.tableaus import ImplicitTableau, Tableau
 from mbkit.model import Model
@@ -42,8 +42,6 @@ STEP_DERIVATIVE: Final = Path(
     also=lambda model: () if model.velocity_map is None else ("it has quasi-velocities of its own",),
     instead="linearize(q, v, tau).discretize(dt) holds the linear system's force",
 )
-#: Newton's iterations for what a step solves.
-MAX_NEWTON_ITERATIONS: Final = 25
 
 
 class Steps(Evaluation):

@@ -43,7 +43,6 @@ _SPEED: Final = {True: 2.0, False: 0.5}
 #: Samples of the search for each period of the highest harmonic, and step of differences of coefficients of order one.
 _SAMPLES_PER_PERIOD: Final = 8
 _COEFFICIENT_STEP: Final = 1e-6
-_RANDOM_TRIALS: Final = 8
 #: Numbers of regressors that are held at once.
 _MAX_BLOCK_NUMBERS: Final = 4_000_000
 
@@ -241,7 +240,7 @@ class _Search:
         """Return the best free numbers found."""
         from scipy.optimize import minimize
 
-        trials = rng.standard_normal((_RANDOM_TRIALS, *self._shape))
+        trials = rng.standard_normal((8, *self._shape))
         values = [self.value(self._equations(x[None])[0])[0] for x in trials]
         best = trials[int(np.argmin(values))]
         done = 0

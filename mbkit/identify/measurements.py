@@ -193,15 +193,12 @@ def _used(dyn: Dynamics, unknowns: Unknowns) -> list[NDArray[np.intp]]:
     return [np.flatnonzero(Y[:, j].any(axis=0)) for j in range(model.nv)]
 
 
-#: Samples of a polynomial, beside the middle one on each side, and its coefficients.
+#: Samples of a polynomial of degree 5, beside the middle one on each side.
 _SIDE_SAMPLES: Final = 4
-_POLYNOMIAL_COEFFICIENTS: Final = 6
 #: Samples that are looked at: more make it no surer.
 _MAX_SAMPLES: Final = 4000
 #: Part of the spread of positions that a polynomial leaves of samples in the order of time, at the most.
 _ORDERED_RESIDUAL_RATIO: Final = 0.1
-#: Draws of noise that are averaged.
-_NOISE_DRAWS: Final = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,7 +336,7 @@ def bias(
     L = _root(errors.T @ errors / len(errors))
 
     # Each with its opposite: odd powers of the noise are chance, and the bias is even.
-    halves = [rng.standard_normal((len(data), 2 * nv)) @ L.T for _ in range(_NOISE_DRAWS)]
+    halves = [rng.standard_normal((len(data), 2 * nv)) @ L.T for _ in range(2)]
     draws = [sign * x for x in halves for sign in (1.0, -1.0)]
 
     def noisy(times: float) -> tuple[Array, Array]:
@@ -365,7 +362,7 @@ def _first(data: Measurements, count: int) -> Measurements:
 def _beside_neighbours(x: Array) -> Array:
     """Return each sample's residual beside a polynomial through it and its neighbours, as large as its noise."""
     k = np.arange(-_SIDE_SAMPLES, _SIDE_SAMPLES + 1.0)
-    A = np.vander(k / _SIDE_SAMPLES, _POLYNOMIAL_COEFFICIENTS)
+    A = np.vander(k / _SIDE_SAMPLES, 6)
     H = np.eye(len(k)) - A @ np.linalg.pinv(A)
     row = H[_SIDE_SAMPLES]
     out = sum(c * x[i : len(x) - 2 * _SIDE_SAMPLES + i] for i, c in enumerate(row))

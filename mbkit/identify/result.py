@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 
+from mbkit._check import MAX_LINES
 from mbkit.errors import InputError, ModelError
 from mbkit.model import Joint, Model
 from mbkit.model.base_parameters import OF_JOINTS, STANDARD, body_of, length_of, standard_names
@@ -15,8 +16,6 @@ from mbkit.model.validation import check_substituted, suspects
 from mbkit.studies.document import Block, Bullet, Column, Document, Items, Section, Table
 from mbkit.studies.results import ResultTable, columns_of
 
-#: Velocities whose residuals are printed.
-_MAX_PRINTED_RESIDUALS: Final = 8
 #: Standard deviations that are no accident: an estimate beyond a bound by less is the bound.
 SIGNIFICANT_DEVIATIONS: Final = 3.0
 
@@ -224,8 +223,8 @@ class Identification(ResultTable):
         if self.undetermined:
             lines += [f"  {len(self.undetermined)} directions that the data cannot tell"]
         lines += ["  residual / torque, root mean squares"]
-        lines += [f"    {r.velocity}: {r.noise:.3g} / {r.torque:.3g}" for r in self.residuals[:_MAX_PRINTED_RESIDUALS]]
-        more = len(self.residuals) - _MAX_PRINTED_RESIDUALS
+        lines += [f"    {r.velocity}: {r.noise:.3g} / {r.torque:.3g}" for r in self.residuals[:MAX_LINES]]
+        more = len(self.residuals) - MAX_LINES
         return "\n".join(lines + ([f"    and {more} more; .residuals has all"] if more > 0 else []))
 
     def document(self) -> Document:

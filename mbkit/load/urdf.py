@@ -224,8 +224,6 @@ URDF: Final = Path(
     joint_types(*_TYPES) | {*_CARRIED.split(), *(f"joint.{x}" for x in DYNAMICS)},
     beside=_notes,
 )
-# Stands for no limit: the largest number that every reader reads.
-_UNLIMITED: Final = 1e308
 
 
 def urdf_text(model: Model, comment: str) -> str:
@@ -282,7 +280,8 @@ def _joint(joint: Joint) -> str:
         if bounded:
             limits = {"lower": joint.lower, "upper": joint.upper} | limits
         if bounded or np.isfinite(list(limits.values())).any():
-            out.append(_element("limit", {k: np.clip(x, -_UNLIMITED, _UNLIMITED) for k, x in limits.items()}))
+            # The largest number that every reader reads stands for no limit.
+            out.append(_element("limit", {k: np.clip(x, -1e308, 1e308) for k, x in limits.items()}))
         dynamics = {k: x for k in DYNAMICS if (x := getattr(joint, k)).any()}
         out += [_element("dynamics", dynamics)] if dynamics else []
     if joint.mimic is not None:

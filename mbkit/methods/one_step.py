@@ -93,6 +93,8 @@ class SemiImplicitEuler:
         return space.retract(q, u), w, u
 
 
+#: Newton's iterations for what a step solves.
+MAX_NEWTON_ITERATIONS: Final = 25
 #: A singular pose is near where J's rows would depend on each other within so many steps at the present pace. At a
 #: third of the way a series of the tightest tolerance never arrives.
 STEPS_TO_POSE: Final = 4

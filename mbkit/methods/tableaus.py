@@ -407,7 +407,7 @@ def rodas5p() -> RosenbrockTableau:
     out: RosenbrockTableau = _unchecked(
         RosenbrockTableau,
         name="rodas5p",
-        gamma=_GAMMA,
+        gamma=0.21193756319429014,
         A=_lower((*_A, _LAST, last[:6], last[:7])),
         C=_lower(_C),
         b=np.array((*last, 1.0)),
@@ -426,7 +426,6 @@ def _lower(rows: tuple[tuple[float, ...], ...]) -> Array:
     return out
 
 
-_GAMMA: Final = 0.21193756319429014
 _A: Final[tuple[tuple[float, ...], ...]] = (
     (),
     (3.0,),

@@ -46,7 +46,6 @@ _MARKS: Final = (
     b"case,parameter,unit,value,engine,method,",
     b"t,q.",
 )
-_HEAD_BYTES: Final = 4096
 
 
 def _is_own(path: Path) -> bool:
@@ -57,7 +56,7 @@ def _is_own(path: Path) -> bool:
             # Equations say at their head with which mbkit they were written; results among other versions.
             return isinstance(data, dict) and "mbkit" in (data | dict(data.get("versions") or {}))
         with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
+            head = file.read(4096)
             file.seek(max(0, os.path.getsize(path) - 64))
             head += file.read()
     except (OSError, ValueError, TypeError, RecursionError):

@@ -10,7 +10,7 @@ import hashlib
 from datetime import datetime
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from mbkit._escape import terminal
 from mbkit.studies.document import Document, Span, spans
@@ -18,10 +18,6 @@ from mbkit.studies.formatting import count_text, error_text, time_text
 
 if TYPE_CHECKING:
     from jinja2 import Environment
-
-#: Letters of a table's cell that stay on one line, and above which the cell is wide.
-_MAX_UNBROKEN_LETTERS: Final = 34
-_MIN_LONG_LETTERS: Final = 60
 
 
 def render(shown: Document, *, data: str = "", table: str = "", when: datetime | None = None) -> str:
@@ -72,4 +68,4 @@ def _environment() -> Environment:
 def _cellsize(cell: list[Span]) -> str:
     """Return the class of a cell that is not to be broken, or that needs room, by the length of its text."""
     size = sum(len(span.text) for span in cell)
-    return "nowrap " if size <= _MAX_UNBROKEN_LETTERS else "long " if size > _MIN_LONG_LETTERS else ""
+    return "nowrap " if size <= 34 else "long " if size > 60 else ""

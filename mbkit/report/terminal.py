@@ -22,8 +22,6 @@ _STYLES: Final[dict[Style, str]] = {
     "muted": "dim",
     "bold": "bold",
 }
-#: Longer texts are cut; the page and the JSON have them whole.
-_MAX_LETTERS: Final = 600
 
 
 def render(shown: Document) -> RenderableType:
@@ -74,7 +72,8 @@ def _bullet(bullet: Bullet) -> RenderableType:
     grid.add_column(width=3, justify="right")
     grid.add_column(overflow="fold")
     head = f"{one_line(bullet.head)}: " if bullet.head else ""
-    text = one_line(bullet.text, _MAX_LETTERS)
+    # Longer texts are cut; the page and the JSON have them whole.
+    text = one_line(bullet.text, 600)
     grid.add_row(Text(bullet.mark, style=_STYLES.get(bullet.style, "")), Text.assemble((head, "bold"), text))
     return grid
 

@@ -37,10 +37,6 @@ _BODIES: Final[tuple[Color, ...]] = (
     (0.52, 0.52, 0.22, 1.0),
 )
 _JOINT: Final[Color] = (0.30, 0.32, 0.35, 1.0)
-#: Radius of a stick as part of the mean distance of joints.
-_STICK_RADIUS_RATIO: Final = 0.06
-#: Frames at which the extent is measured.
-_EXTENT_FRAMES: Final = 40
 #: The camera's half angle in degrees, its elevation in rad, and a picture's width over its height.
 HALF_ANGLE_DEGREES: Final = 17.5
 _CAMERA_ELEVATION: Final = 0.3
@@ -111,7 +107,7 @@ def stand_ins(model: Model, bodies: set[str]) -> list[Shape]:
     boxes = {body.name: inertia_box(body) for body in model.bodies}
     lengths = [float(np.linalg.norm(p)) for places in ends.values() for p in places if has_length(p)]
     lengths = lengths or [2 * float(np.linalg.norm(half)) for _, half in boxes.values() if half.any()] or [1.0]
-    radius, longest = _STICK_RADIUS_RATIO * float(np.mean(lengths)), 1.5 * max(lengths)
+    radius, longest = 0.06 * float(np.mean(lengths)), 1.5 * max(lengths)
     out: list[Shape] = []
     moving = {joint.child: joint for joint in model.joints if joint.type.nv}
     for k, body in enumerate(model.bodies):
@@ -192,7 +188,7 @@ class Scene:
             V = np.concatenate([s.vertices for s in shape.surfaces])
             corners.append(list(product(*zip(V.min(axis=0), V.max(axis=0), strict=True))))
         points = [self.translations[:, 0]] if not corners else []
-        for frame in np.unique(np.linspace(0, len(self.t) - 1, _EXTENT_FRAMES).astype(int)) if corners else ():
+        for frame in np.unique(np.linspace(0, len(self.t) - 1, 40).astype(int)) if corners else ():
             R, p = self.placements(frame)
             points.append((np.einsum("nij,ncj->nci", R, np.array(corners)) + p[:, None]).reshape(-1, 3))
         every = np.concatenate(points)

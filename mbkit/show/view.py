@@ -232,7 +232,6 @@ def _packed(surface: Surface, put: Any) -> dict[str, Any]:
 #: Frames that a page and a film hold at most.
 _MAX_PAGE_FRAMES: Final = 2000
 _MAX_FILM_FRAMES: Final = 20_000
-_PAGE_FRAMES_PER_SECOND: Final = 60.0
 _SUFFIXES: Final = (".html", *PICTURES, *FILMS)
 
 
@@ -358,7 +357,7 @@ def animate(
         raise InputError(f"{model.name}: the trajectory has no state with finite numbers, so nothing can be shown")
     t, q = t[good], model.check_q(_with_motions(model, q[good], t[good]))
     filmed = path is not None and Path(path).suffix.lower() in FILMS
-    rate = real("fps", fps, positive=True) if filmed else _PAGE_FRAMES_PER_SECOND
+    rate = real("fps", fps, positive=True) if filmed else 60.0
     most = _MAX_FILM_FRAMES if filmed else _MAX_PAGE_FRAMES
     frames = int(min((t[-1] - t[0]) * rate, most)) + 1
     if filmed and frames > most:

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import Array, finite_array
+from mbkit._check import EPS, Array, finite_array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
 from mbkit.errors import FunctionError, MbkitWarning, NumericalError, UnsupportedError, warn
@@ -36,10 +36,6 @@ from mbkit.simulate.torque import Force, Torque
 _WORN: Final = "the dependent coordinates are badly chosen"
 _NEAR: Final = "near a singular pose"
 _ENDLESS: Final = "stopped at t = {t:.9g} s, where no independent coordinates serve: charts end where they begin"
-#: Distance behind a singular pose from which charts serve again, in distances at which they end.
-_DISTANCE_BEHIND_POSE: Final = 20
-#: Smallest measure of a chart; its logarithm must be finite.
-_MIN_MEASURE: Final = 1e-16
 
 
 def integrate_on_charts(system: Embedded, request: RunRequest) -> tuple[RunData, FunctionError | None]:
@@ -145,7 +141,7 @@ class _OnChart:
                 value = measure(self.chart, self._place(t, u), t)
             except NumericalError:
                 value = 0.0
-            return float(np.log(max(value, _MIN_MEASURE) / limit))
+            return float(np.log(max(value, EPS) / limit))
 
         # On coordinates that stay, the motion beyond the pose would come out wrong.
         return Event(function, what, direction=-1, terminal=what == _WORN or system.model.time_parameter is None)
@@ -223,7 +219,8 @@ class _Charts:
             return np.inf
         near = self.system.nearness(chart, q, t)
         rate = abs(self.system.nearness(chart, q + step / size * v, t) - near) * size / step
-        return _DISTANCE_BEHIND_POSE * max(near, SINGULAR_VALUE_RATIO) / rate if rate else np.inf
+        # Behind the pose charts serve again at some times the distance at which they end.
+        return 20 * max(near, SINGULAR_VALUE_RATIO) / rate if rate else np.inf
 
 
 class _ChartStepper(Stepper):

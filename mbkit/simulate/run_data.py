@@ -103,9 +103,6 @@ class SolverResult(Stats):
 
 #: Most states at once: the matrices of a long run would fill the memory.
 _MAX_STATES: Final = 4096
-#: Fraction of an interval between the ends of differences, which lose a third of the digits of a term that is h/12 of
-#: the whole.
-_DIFFERENCE_FRACTION: Final = 1e-4
 
 #: Frames on which wrenches acted, and the axes of these.
 Acting = tuple[tuple[Frame, ...], str]
@@ -460,7 +457,8 @@ def _with_rate(
     """Return a power of (q, v), and its rate along the motion; by states on one side where `inward` is 1 or -1."""
     model, clock = dyn.model, dyn.model.time_parameter
     of_samples: Any = dyn
-    up = down = np.broadcast_to(_DIFFERENCE_FRACTION * h, (*q.shape[:-1], 1))
+    # Differences over so small a part of an interval lose a third of the digits of a term that is h/12 of the whole.
+    up = down = np.broadcast_to(1e-4 * h, (*q.shape[:-1], 1))
     if clock is not None:
         # The time is the last parameter; beyond its ends a table is not known.
         times = of_samples._parameter_values[:, -1].reshape(up.shape)

@@ -249,7 +249,7 @@ def describe_poses(poses: Mapping[int, SingularPoses], batch: int | None, tolera
         return ""
     first, times = min(passed.items())
     of = "" if batch is None else f"{len(passed)} of {batch} trajectories passed singular poses; trajectory {first} "
-    when = ", ".join(f"{t:.4g}" for t in times[:3]) + (" and later" if len(times) > 3 else "")
+    when = ", ".join(f"{t:.4g}" for t in times[:MAX_NAMES]) + (" and later" if len(times) > MAX_NAMES else "")
     error = f"; a step there may be off by {LOOSEST:g} whatever the tolerance" if tolerance else ""
     return (
         f"{of}passed a singular pose at t = {when} (s), where {' and '.join(poses[first].rows)} lose their "

@@ -32,8 +32,6 @@ from mbkit.simulate.torque import Force, TorqueCallback, TorqueFunction
 _TWIN: Final = "_derived_twin"
 #: Smallest Re λ over |λ| of a motion that grows rather than oscillates.
 _MIN_GROWTH_SHARE: Final = 0.1
-#: Smallest rate that is shown, relative to the fastest.
-_MIN_SHOWN_SHARE: Final = 1e-3
 #: Number of rows up to which a norm is not worth its time.
 _MAX_SMALL_ROWS: Final = 20
 
@@ -215,7 +213,7 @@ class Stiffness:
             return f"no rate above {self.bound:.2g} 1/s"
         units = {"decay": "1/s", "oscillation": "rad/s", "growth": "1/s"}
         rates = {name: getattr(self, name) for name in units}
-        parts = [f"fastest {k} {x:.2g} {units[k]}" for k, x in rates.items() if x > _MIN_SHOWN_SHARE * self.rate]
+        parts = [f"fastest {k} {x:.2g} {units[k]}" for k, x in rates.items() if x > 1e-3 * self.rate]
         return ", ".join(parts) or "no motion of its own"
 
     def __repr__(self) -> str:

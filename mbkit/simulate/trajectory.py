@@ -19,6 +19,7 @@ from mbkit import _check
 from mbkit._check import Array, by_key
 from mbkit._escape import csv_text, html, one_line
 from mbkit.engines import Dynamics
+from mbkit.engines.base import MAX_NAMES
 from mbkit.errors import InputError, LoadError, MbkitWarning, UnsupportedError, writing
 from mbkit.methods.registry import AUTOMATIC_METHOD, METHODS, Method
 from mbkit.model import Model
@@ -35,8 +36,6 @@ if TYPE_CHECKING:
 
     from mbkit.show import Kind, View
 
-#: Number of times of an event that `repr` shows.
-_SHOWN_TIMES: Final = 4
 #: Fewest and most steps with which a method of first order is compared with itself at twice the step.
 _DOUBLED_STEPS: Final = (4, 20_000)
 #: Largest gap, relative to the motion: a hundredth is wrong, and at a few times the gap is not yet the largest.
@@ -344,7 +343,7 @@ class Trajectory(RunData):
     def _event_times(self) -> str:
         """Return the events' names and times, the first few of each name."""
         return "; ".join(
-            f"{name} at {', '.join(each[:_SHOWN_TIMES])} s" + (f" ({len(each)})" if len(each) > _SHOWN_TIMES else "")
+            f"{name} at {', '.join(each[:MAX_NAMES])} s" + (f" ({len(each)})" if len(each) > MAX_NAMES else "")
             for name, each in by_key((hit.name, f"{hit.t:.6g}") for hit in self.events).items()
         )
 

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from mbkit import _process as _interrupt
-from mbkit._check import ITERATED
+from mbkit._check import ITERATED, PROBES
 from mbkit._escape import xml_holds
 from mbkit._version import __version__
 from mbkit.engines import dynamics
@@ -29,7 +29,6 @@ from mbkit.studies.explain.study import explain
 from mbkit.studies.explain.terms import Gap, evaluated, gaps, model_terms, states_of, worst
 
 FORMATS: Final = ("mjcf", "urdf")
-_STATES: Final = 5
 
 
 @dataclass(frozen=True)
@@ -122,7 +121,7 @@ def _to_mjcf(model: Model) -> Converted:
 
     notes = MJCF.admit(model)
     text = mjcf_text(model, _head(model, "agreed with the description by MuJoCo's parser and terms"))
-    at = states_of(model, _STATES, 0)
+    at = states_of(model, PROBES, 0)
     back = read_back(model, text)
     # MuJoCo refuses by name the accelerations that it cannot give: loops beside mimic joints.
     back.mass_matrix(at.q)
@@ -148,7 +147,7 @@ def _to_urdf(model: Model) -> Converted:
         path.write_text(text, encoding="utf-8")
         with warnings.catch_warnings(action="ignore", category=MbkitWarning):
             back = load(path, gravity=model.gravity, nonphysical="warn")
-    explanation = explain(model, back, samples=_STATES, tolerance=ITERATED, names=("description", "URDF"))
+    explanation = explain(model, back, samples=PROBES, tolerance=ITERATED, names=("description", "URDF"))
     if explanation.acting or not (explanation.agree or explanation.massless):
         reasons = "; ".join(map(str, explanation.acting)) or explanation.verdict
         raise MbkitError(

@@ -53,8 +53,6 @@ from mbkit.studies.study_runs import Deadline, TooLongError, quiet_simulate
 
 # Parts of the motion that two engines run by turns, so that they stop soon after they part.
 _MAX_STRETCHES: Final = 20
-# The second Taylor run's tolerance over the first one's: one order less, so other steps, rounding and truncation.
-_SECOND_TOLERANCE_RATIO: Final = 8.0
 #: Engines and methods of each of two independent runs, best first: all, the quick ones, and those for stiff motion.
 _EngineChoices = tuple[tuple[tuple[str, str], ...], ...]
 _INDEPENDENT_CHOICES: Final[_EngineChoices] = (
@@ -70,8 +68,6 @@ _STIFF_CHOICES: Final[_EngineChoices] = (
 MAX_RELATIVE_GAP: Final = 1e-12
 # Two runs that are farther apart than this, rad or m, have parted for good.
 _PARTED_GAP: Final = 1e-6
-# Tolerance of methods for stiff motion over the wanted error: a smaller one costs them dear.
-_STIFF_TOLERANCE_PART: Final = 1e-3
 
 
 #: (high, low) parts of numbers with twice a double's digits.
@@ -175,7 +171,8 @@ def taylor_pair(motion: Motion, deadline: Deadline, bits: int) -> RunPair:
     with deadline.paused():
         system = taylor_system(motion.equations)
     constants = kind.array(motion.equations.constant_values)
-    tolerances = kind.eps, _SECOND_TOLERANCE_RATIO * kind.eps
+    # One order less: so other steps, rounding and truncation.
+    tolerances = kind.eps, 8.0 * kind.eps
     runs: list[list[Any]] = []
     steps, why = 0, ""
     for i, tolerance in enumerate(tolerances):
@@ -308,8 +305,6 @@ def _stretch(
 # The floor over the difference of two runs: errors partly cancel in it, and by more digits a run was up to three times
 # as wrong.
 _FLOOR_PER_GAP: Final = 4.0
-# Seconds per operation, order² and step in quadruple precision.
-_SECONDS_PER_QUADRUPLE_OPERATION: Final = 1.0e-8
 # A small system's steps per second of motion: a guess before there is a run.
 _TYPICAL_STEPS_PER_SECOND: Final = 40.0
 # A search with less time left than this makes no series: they need seconds to derive and compile, which it does not
@@ -492,7 +487,8 @@ def _search(
     if wanted > MAX_RELATIVE_GAP:
         for choices, rtol, part in (
             (_QUICK_CHOICES, 0.0, 0.25),
-            (_STIFF_CHOICES, _STIFF_TOLERANCE_PART * wanted, 0.75),
+            # A tolerance below a thousandth of the wanted error costs methods for stiff motion dear.
+            (_STIFF_CHOICES, 1e-3 * wanted, 0.75),
         ):
             if holds(two_engines, choices, rtol, max(agree, _PARTED_GAP), within=part * deadline.left):
                 return pairs, refused
@@ -520,7 +516,8 @@ def _quadruple_seconds(motion: Motion, steps: float) -> float:
         order, operations = order_of(precision(113).eps), taylor_system(motion.equations).operations
     except UnsupportedError:
         return inf
-    return 2 * steps * operations * order**2 * _SECONDS_PER_QUADRUPLE_OPERATION
+    # Two runs, at so many seconds per operation, order² and step in quadruple precision.
+    return 2 * steps * operations * order**2 * 1e-8
 
 
 def _cut(motion: Motion, known: RunPair, agree: float) -> Reference:
@@ -554,10 +551,6 @@ def _cut(motion: Motion, known: RunPair, agree: float) -> Reference:
     )
 
 
-#: Letters of a reason why an engine is no witness.
-_MAX_REASON_LETTERS: Final = 120
-
-
 def _accelerations_text(motion: Motion, best: Reference) -> str:
     """Return a text that compares accelerations along a motion with those of another engine."""
     which = np.unique(np.linspace(0, len(best.t) - 1, min(_MAX_COMPARED_STATES, len(best.t))).astype(int))
@@ -573,7 +566,7 @@ def _accelerations_text(motion: Motion, best: Reference) -> str:
             _require_rigid(dyn)
             other = _accelerations(dyn, best.t[which], q, v, tau)
         except MbkitError as error:
-            failed.append(one_line(str(error), _MAX_REASON_LETTERS))
+            failed.append(one_line(str(error), 120))
             continue
         apart = np.abs(a - other).max() / (np.abs(a).max() or 1.0)
         return f"; accelerations along it differ by {apart:.1e} from those of {engine}"

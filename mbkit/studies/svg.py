@@ -31,9 +31,9 @@ _VARIABLES: Final = {
     **{colour: f"var(--series{k})" for k, colour in enumerate(PAGE.series, 1)},
 }
 PAGE_WIDTH_INCHES: Final = 10.4
+PANELS_PER_ROW: Final = 5
 #: Pixels of the smallest letters of a figure, however narrow the window.
 _MIN_LETTER_PIXELS: Final = 10.0
-_DOTS_PER_INCH: Final = 160
 
 
 @contextmanager
@@ -87,6 +87,6 @@ def image(fig: Figure, ending: str = "png") -> bytes:
     stream = io.BytesIO()
     marks: dict[str, Any] = {"png": {"Software": "mbkit"}, "svg": {"Creator": "written by mbkit", "Date": None}}
     with drawing(more={"svg.hashsalt": "mbkit"}):
-        fig.savefig(stream, format=ending, dpi=_DOTS_PER_INCH, facecolor="white", metadata=marks[ending])
+        fig.savefig(stream, format=ending, dpi=160, facecolor="white", metadata=marks[ending])
     content = stream.getvalue()
     return _titled(content.decode()).encode() if ending == "svg" else content

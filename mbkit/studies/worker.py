@@ -20,7 +20,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from mbkit._child_process import Child, WorkerDiedError, WorkerStartError, WorkerTimeoutError, cores
+from mbkit._child_process import START_SECONDS, Child, WorkerDiedError, WorkerStartError, WorkerTimeoutError, cores
 from mbkit.engines.registry import registered_engines
 from mbkit.engines.remote.served.serve import attend
 from mbkit.errors import InputError, MbkitError
@@ -28,8 +28,6 @@ from mbkit.methods.registry import METHODS, registered_methods
 
 T = TypeVar("T")
 
-#: Seconds until a worker has started.
-_START: Final = 60.0
 #: Seconds after which a worker that nobody calls gives its memory back.
 _IDLE: Final = 900.0
 #: The folders of modules are known before the worker changes into its own folder.
@@ -91,7 +89,7 @@ class Worker(Child):
         main = spawn.get_preparation_data("mbkit") if b"__main__" in call else {}
         main = {k: x for k, x in main.items() if k.startswith("init_main")}
         try:
-            self._start(_START)
+            self._start(START_SECONDS)
         except (WorkerDiedError, WorkerTimeoutError) as error:
             raise WorkerStartError(
                 f"worker processes do not start: {error}; each needs some 300 MB of memory, "

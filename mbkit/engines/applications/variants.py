@@ -19,7 +19,7 @@ from typing import Any, Final, overload
 
 import numpy as np
 
-from mbkit._check import ROUNDING, Array, by_key, count, finite_array, real, shown
+from mbkit._check import MAX_LINES, ROUNDING, Array, by_key, count, finite_array, real, shown
 from mbkit._escape import csv_text, html
 from mbkit.engines.base import Dynamics
 from mbkit.engines.registry import DERIVED, dynamics, find_engine
@@ -41,9 +41,6 @@ from mbkit.model.model import Model
 Spread = float | tuple[float, float] | Callable[[np.random.Generator, int], Any]
 #: All ten numbers of a body together.
 _INERTIAL: Final = ".inertial"
-#: Standard deviation of a logarithm beyond which it is a factor of more than e: per cent are a common reason.
-_WIDE_LOG_DEVIATION: Final = 1.0
-_MAX_SHOWN_NUMBERS: Final = 12
 _LOWER: Final = np.tril_indices(3)
 
 
@@ -125,8 +122,8 @@ class Variants:
 
     def __str__(self) -> str:
         rows = [("number", "nominal", "mean", "std", "range"), *self._summary()]
-        more = len(rows) - 1 - _MAX_SHOWN_NUMBERS
-        rows = rows[: _MAX_SHOWN_NUMBERS + 1]
+        more = len(rows) - 1 - MAX_LINES
+        rows = rows[: MAX_LINES + 1]
         widths = [max(len(row[k]) for row in rows) for k in range(5)]
         lines = ["  ".join(x.ljust(w) for x, w in zip(row, widths, strict=True)).rstrip() for row in rows]
         head = f"{self.model.name}: {len(self)} variants, seed {self.seed}"
@@ -197,7 +194,8 @@ def variants(robot: Model, spread: Mapping[Any, Spread], *, size: int = 1000, se
         with np.errstate(over="ignore", invalid="ignore"):
             drawn = _drawn(model, path, how, rng, size)
         factor = drawn and not callable(how) and shape_of(how) == () and not {*drawn} <= added
-        if factor and (away := real("spread", how)) > _WIDE_LOG_DEVIATION:
+        # A factor of more than e: per cent are a common reason.
+        if factor and (away := real("spread", how)) > 1.0:
             name, x = next(iter(drawn.items()))
             says = "is the standard deviation of the logarithm, in which 0.1 is about 10 %"
             warn(f"spread: {str(path)!r}: {away:g} {says}; {name!r} is {x.min():.1g} to {x.max():.1g}", MbkitWarning)

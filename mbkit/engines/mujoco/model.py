@@ -75,7 +75,6 @@ _BALL, _FREE = mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE
 _X, _Y, _Z = np.eye(3)
 # A ball joint can only be the last of a stack: its quaternion is in the body's own axes.
 _STACKABLE: Final = tuple(STACKS)
-_OPEN_RANGE: Final = 1e10
 #: Numbers of a coupling that a tendon has by the same name, its inertia among them.
 OF_COUPLING: Final = tuple(name for name, rule in rules_of(JointCoupling).items() if rule.does)
 (INERTIA,) = JointCoupling.adding_to("T")
@@ -405,7 +404,7 @@ def _add_joint(new: Any, joint: Joint, R: Array, p: Array, placed: Placed, at_or
             low, high = float(joint.lower[k]), float(joint.upper[k])
             if np.isfinite([low, high]).any() and low < high:
                 # MuJoCo has no open end; this one is never reached.
-                j.limited, j.range = 1, [max(low, -_OPEN_RANGE), min(high, _OPEN_RANGE)]
+                j.limited, j.range = 1, [max(low, -1e10), min(high, 1e10)]
 
 
 def _set(element: Any, name: str, number: float) -> None:

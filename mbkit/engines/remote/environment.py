@@ -22,10 +22,11 @@ from typing import Final
 from packaging.version import InvalidVersion, Version
 from platformdirs import user_cache_path
 
+from mbkit._child_process import START_SECONDS
 from mbkit.errors import OutputError, UnknownNameError, UnsupportedError
 
-#: Seconds that pip may take, and the import of an engine.
-_INSTALL_SECONDS, _IMPORT_SECONDS = 1800.0, 120.0
+#: Seconds that pip may take.
+_INSTALL_SECONDS: Final = 1800.0
 #: Words of pip where a version does not exist, or where it reached no index.
 _VERSIONS: Final = re.compile(r"from versions: ([^)]*)\)")
 _NO_VERSION: Final = "there is no version of"
@@ -207,7 +208,7 @@ def available(distribution: str) -> tuple[str, ...]:
     """
     if not find_spec("pip"):
         raise UnsupportedError(f"the versions of {distribution} are not known without pip; name them one by one")
-    done = _finished([sys.executable, "-m", "pip", "index", "versions", distribution], _IMPORT_SECONDS)
+    done = _finished([sys.executable, "-m", "pip", "index", "versions", distribution], START_SECONDS)
     found = _AVAILABLE.search(done.stdout)
     if found is None:
         raise UnsupportedError(f"the versions of {distribution} are not known; {_reason(done.stderr)}")
@@ -225,13 +226,13 @@ def _reason(said: str) -> str:
 
 def _import_failure(path: Path, module: str) -> str:
     """Return why the interpreter of an environment cannot import a module; empty where it can."""
-    done = _finished([str(python_of(path)), "-E", "-s", "-c", f"import numpy, {module}"], _IMPORT_SECONDS)
+    done = _finished([str(python_of(path)), "-E", "-s", "-c", f"import numpy, {module}"], START_SECONDS)
     lines = [line for line in done.stderr.splitlines() if line.strip()]
     return "" if done.returncode == 0 else (lines or [f"status {done.returncode}"])[-1]
 
 
 def _run(command: list[str], what: str) -> None:
-    done = _finished(command, _IMPORT_SECONDS)
+    done = _finished(command, START_SECONDS)
     if done.returncode:
         said = " ".join((done.stderr or done.stdout).split())
         raise UnsupportedError(f"no environment can be made here; {what}: {said[:400]}")

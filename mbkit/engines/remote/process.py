@@ -17,14 +17,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from mbkit._check import Array
-from mbkit._child_process import Child, WorkerDiedError, WorkerStartError, WorkerTimeoutError
+from mbkit._child_process import START_SECONDS, Child, WorkerDiedError, WorkerStartError, WorkerTimeoutError
 from mbkit._process import fork_safe
 from mbkit.engines.remote.packages import EngineVersion
 from mbkit.engines.remote.served import serve
 from mbkit.errors import EngineProcessError, UnsupportedError
 
-#: Seconds until a library is loaded.
-_START_SECONDS: Final = 120.0
 _SERVE: Final = Path(serve.__file__)
 
 
@@ -66,8 +64,8 @@ class EngineProcess(Child):
 
     def start(self) -> int:
         """Start the process unless it runs, and return its generation."""
-        with self._lock, self._translating_errors(_START_SECONDS):
-            self._start(_START_SECONDS)
+        with self._lock, self._translating_errors(START_SECONDS):
+            self._start(START_SECONDS)
         return self.generation
 
     def _command(self, handle: int) -> tuple[Sequence[str], Mapping[str, str]]:

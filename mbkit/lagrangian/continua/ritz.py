@@ -51,8 +51,6 @@ class NormalModes:
 #: Digits of Ritz's matrices, enough for `MAX_MODES`: n powers cost 1.2 n of them. Shapes are written with fewer.
 _MATRIX_DIGITS: Final = 200
 _SHAPE_DIGITS: Final = 60
-#: Monomials beside 2 n for n modes; so many more have to give the same frequencies, in so many refinements.
-_EXTRA_MONOMIALS, _ADDED_MONOMIALS, _MAX_REFINEMENTS = 12, 6, 4
 #: A pivot is zero below this part of its diagonal entry.
 _ZERO_PIVOT_RATIO: Final = 1e-100
 
@@ -74,13 +72,13 @@ def normal_modes(system: Densities, count: int, values: Mapping[Any, float]) -> 
         raise InputError(f"values: no value for {plain(missing)}; a mode of free vibration takes one of each parameter")
     ritz = _Ritz(system, {s: numbers[s.name] for s in own})
     before: Any = None
-    for step in range(_MAX_REFINEMENTS):
-        squares, vectors, shift = ritz.eigenpairs(2 * count + _EXTRA_MONOMIALS + _ADDED_MONOMIALS * step, count)
+    # More powers have to give the same frequencies.
+    for powers in range(2 * count + 12, 2 * count + 36, 6):
+        squares, vectors, shift = ritz.eigenpairs(powers, count)
         if before is not None and (np.abs(before - squares) <= ITERATED * max(squares.max(), shift)).all():
             break
         before = squares
     else:
-        powers = 2 * count + _EXTRA_MONOMIALS + _ADDED_MONOMIALS * step
         raise NumericalError(
             f"values: the frequencies do not settle to ten digits with {powers} powers of "
             "x; T and V need coefficients that are smooth between the ends, and not too many modes at once"

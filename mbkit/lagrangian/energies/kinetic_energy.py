@@ -97,9 +97,6 @@ def _quadratic(x: sp.Expr, velocities: Sequence[sp.Symbol]) -> bool:
 
 # The test that every motion has kinetic energy, or is bound by a constraint.
 
-#: Coordinates at every other place are nearer to zero by this factor.
-_NEAR_ZERO_FACTOR: Final = 1e-3
-
 
 def require_inertia(M: sp.ImmutableMatrix, velocities: Sequence[sp.Symbol], J: sp.ImmutableMatrix) -> None:
     """Refuse a mass matrix that is singular everywhere, unless constraints bind its massless directions (InputError).
@@ -158,7 +155,7 @@ def warn_of_negative(
     probe, n, direction = RandomEvaluation([*M]), len(velocities), None
     for seed in range(2 * PROBES):
         # Small deflections too: what holds for these alone, as of beams, may be negative far away.
-        place = {s: x * _NEAR_ZERO_FACTOR ** (seed % 2) for s, x in probe.place(seed).items()}
+        place = {s: x * 1e-3 ** (seed % 2) for s, x in probe.place(seed).items()}
         entries = probe({**place, **{s: mpmath.mpf(x) for s, x in numbers.items()}})
         if entries is None or any(mpmath.im(x) for x in entries):
             return

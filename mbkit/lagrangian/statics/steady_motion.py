@@ -26,8 +26,6 @@ from mbkit.lagrangian.system import Lagrangian
 
 #: Condition of the scaled mass matrix of cyclic coordinates; its square times eps is the error of the stiffness.
 _SINGULAR_CONDITION: Final = 1e5
-#: Distance to neighbouring places, relative to a coordinate's size.
-_NEIGHBOUR_RATIO: Final = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +135,7 @@ def steady_motion(
     q, v = np.zeros(len(system.coordinates)), np.zeros(len(system.coordinates))
     q[remaining], v[cyclic] = rest.q, turning
     if turning.any():
-        steps = _NEIGHBOUR_RATIO * np.diag(np.maximum(1.0, abs(q)))[remaining]
+        steps = 1e-3 * np.diag(np.maximum(1.0, abs(q)))[remaining]
         neighbours = np.concatenate([[q], q + steps, q - steps])
         _refuse_pole(_at(system, values).mass_matrix(neighbours)[:, cyclic][:, :, cyclic], reduced, rest.q)
     rates_by_name = {s.name: float(x) for s, x in zip(reduced.cyclic, turning, strict=True)}

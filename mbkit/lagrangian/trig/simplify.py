@@ -343,16 +343,12 @@ def _turns(angle: sp.Expr) -> dict[sp.Expr, int]:
 
 # Zero tests by values at random places: with more digits only the value of a zero gets smaller.
 
-#: Digits of values, and of the second evaluation of a zero test.
+#: Digits of values; a zero test evaluates again with twice as many.
 PROBE_DIGITS: Final = 30
-_FINE_DIGITS: Final = 60
 #: A number computed with `PROBE_DIGITS` is zero below this part of those that it is computed from.
 ZERO_PROBE_RATIO: Final = 1e-20
 #: Negligible beside terms of the order of 1.
 _ZERO_VALUE: Final = 1e-50
-#: Places that must agree; more of them where signs decide.
-_AGREEING_PLACES: Final = 2
-_AGREEING_SIGNED_PLACES: Final = 8
 
 
 class RandomEvaluation:
@@ -394,10 +390,11 @@ def is_zero(x: sp.Expr) -> bool:
     if not x.free_symbols or x.is_zero is not None or x.has(sp.Piecewise, sp.Max, sp.Min):
         return bool(x == 0 or x.is_zero)
     broken = x.has(sp.Abs, sp.sign) or any(not p.exp.is_Integer for p in x.atoms(sp.Pow))
-    probe, needed = RandomEvaluation([x]), _AGREEING_SIGNED_PLACES if broken else _AGREEING_PLACES
+    # Places that must agree are more where signs decide.
+    probe, needed = RandomEvaluation([x]), 8 if broken else 2
     for seed in range(2 * needed):
         place = probe.place(seed)
-        rough, fine = (probe(place, digits) for digits in (PROBE_DIGITS, _FINE_DIGITS))
+        rough, fine = (probe(place, digits) for digits in (PROBE_DIGITS, 2 * PROBE_DIGITS))
         if rough is None or fine is None:
             continue
         if abs(fine[0]) > max(ZERO_PROBE_RATIO * abs(rough[0]), _ZERO_VALUE):

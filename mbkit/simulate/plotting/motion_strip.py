@@ -243,8 +243,6 @@ ACCENT: Final = PLAIN.series[1]
 GHOST: Final = "#c4ccd4"
 #: Inches, at most.
 _SIZE: Final = (11.0, 8.0)
-#: Width by height of the whole that reads best.
-_SHAPE: Final = 3.0
 #: Inches that a time needs below its window, and from one to the next.
 _LINE: Final = 0.3
 _TIME: Final = 0.95
@@ -254,8 +252,6 @@ _SIDE: Final = [0, 1, 3, 2]
 _DOTS: Final[Any] = {"marker": "o", "linestyle": "none"}
 #: Steps of the path between two figures.
 _FINE: Final = 40
-#: A run that diverged is drawn up to so many times the size of its first figures.
-_FAR: Final = 6.0
 
 
 class _Strip:
@@ -283,7 +279,8 @@ class _Strip:
     def _waste(self, figures: int, columns: int) -> float:
         rows = -(-figures // columns)
         shape = columns * self._cell[0] / (rows * self._cell[1])
-        return float(abs(math.log(shape / _SHAPE)) + 2 * math.log(columns * rows / figures))
+        # Three times as wide as high reads best.
+        return float(abs(math.log(shape / 3.0)) + 2 * math.log(columns * rows / figures))
 
     def draw(self, axis: Axes, k: int, t: float, before: int, now: int) -> None:
         """Draw figure k at t (s), the one before it and the path between, by their indices of time."""
@@ -408,4 +405,5 @@ def _near(points: Array, diverged: bool) -> NDArray[np.bool_]:
     centre = points[:, np.flatnonzero(good)[0]].mean(axis=0)
     away = np.abs(points - centre).max(axis=(0, 2))
     usual = float(away[good][: max(3, len(good) // 20)].max())
-    return np.asarray(good & (away <= _FAR * usual))
+    # A run that diverged is drawn up to some times the size of its first figures.
+    return np.asarray(good & (away <= 6.0 * usual))

@@ -25,10 +25,6 @@ _DRAWN: Final = 10
 #: Lines differ by colour, then by dashes; more than so many have no legend.
 _DASHES: Final = ("-", (0, (4, 2)), (0, (1, 1.2)), (0, (6, 1.5, 1, 1.5)))
 _NAMED: Final = len(_DASHES) * len(PLAIN.series)
-_LEGEND_ROWS: Final = 8
-_MARKED: Final = 20
-#: Width of a letter above a panel, as a part of the panel.
-_LETTER: Final = 0.023
 _SIZES: Final[dict[str, Any]] = {"axes.grid": True, "font.size": 9.0, "lines.linewidth": 1.4, "legend.fontsize": 8.0}
 
 
@@ -156,7 +152,8 @@ def _lines(
             axis.plot(t, x, label=None if i else name or None, **style)
     axis.set_ylabel(label)
     if legend and len(names) <= _NAMED and all(names) and len(members):
-        columns = math.ceil(len(names) / _LEGEND_ROWS)
+        # So many names have room below each other.
+        columns = math.ceil(len(names) / 8)
         axis.legend(loc="center left", bbox_to_anchor=(1, 0.5), ncols=columns, handlelength=1.8)
 
 
@@ -206,14 +203,16 @@ def _mark(axes: Any, run: RunData) -> None:
     # Names that would meet stand one above the other; (left, right) of each, row by row.
     taken: list[list[tuple[float, float]]] = []
     named: set[str] = set()
-    for t, name, colour in marks[:_MARKED]:
+    # More lines would hide the curves.
+    for t, name, colour in marks[:20]:
         for axis in axes.flat:
             axis.axvline(t, color=colour, linewidth=0.9, linestyle=(0, (3, 2)))
         if name in named:
             continue
         named.add(name)
         text = textwrap.shorten(name, 30)
-        at, width = (t - start) / span, _LETTER * (len(text) + 1)
+        # A letter's width is a part of the panel's.
+        at, width = (t - start) / span, 0.023 * (len(text) + 1)
         own = (at, at + width) if at < 0.5 else (at - width, at)
         free = (k for k, row in enumerate(taken) if all(own[1] <= x or y <= own[0] for x, y in row))
         row = next(free, len(taken))

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import pairwise
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -37,9 +37,6 @@ from mbkit.simulate.solvers.trajectory_record import (
 from mbkit.simulate.solvers.vector_field import DivergenceError, Rates, are_bounded, is_bounded
 from mbkit.simulate.time_grid import check_room
 from mbkit.simulate.torque import Force
-
-#: Forward dynamics of each step that DOP853 tries.
-_STAGES: Final = 12
 
 
 def run_scipy(problem: IntegrationProblem) -> SolverResult:
@@ -135,7 +132,8 @@ class _Solve:
         if not self._method.multistep and solver.status == "finished" and solver.step_size < wanted:
             _resize(solver, max(wanted, solver.h_abs))
         if not self._method.jacobian:
-            attempts = (self.rates.evaluations - before) // _STAGES
+            # DOP853 evaluates the forward dynamics so often in each step that it tries.
+            attempts = (self.rates.evaluations - before) // 12
             record.rejected += max(0, attempts - (solver.status != "failed"))
         while self._method.scheme == "LSODA" and solver.status != "failed" and not is_bounded(solver.y):
             # It steps into non-finite states; the others shorten the step by themselves.

@@ -15,7 +15,7 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from mbkit._check import EPS, Array
-from mbkit.engines.steps import MAX_NEWTON_ITERATIONS
+from mbkit.methods.one_step import MAX_NEWTON_ITERATIONS
 from mbkit.methods.tableaus import ImplicitTableau, extrapolation_weights, gauss_legendre
 from mbkit.model.integration_space import Space
 from mbkit.simulate.singular_poses import time_ahead, undetermined

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Final, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -82,10 +82,6 @@ class StepAttempts(Protocol):
         """Return (q, w) at times, (m, nq) and (m, nv), each by one step from the state of the same row."""
 
 
-#: Stages of an adaptive step near a singular pose: its error grows as that of rk853.
-_STAGES_NEAR_POSE: Final = 8
-
-
 class RungeKuttaAttempts:
     """Attempts of rk853, one step of one trajectory at a time; `StepAttempts` says what its methods do."""
 
@@ -103,7 +99,8 @@ class RungeKuttaAttempts:
         self._stages = ArrayStages(self._tableau.stages, (space.nv,))
         self._force: Force = np.zeros(space.nv)
         self._h = self._t = self._stop = 0.0
-        self._why, self._near_pose = "", StepNearPose(self._field, space, _STAGES_NEAR_POSE)
+        # The error of a step with 8 stages near a singular pose grows as that of rk853.
+        self._why, self._near_pose = "", StepNearPose(self._field, space, 8)
         #: The states within the last step, if it was near a singular pose.
         self._within_last: StepPolynomial | None = None
 
@@ -346,10 +343,6 @@ class AcrossPoses(RungeKuttaAttempts):
         return np.concatenate([q, self._space.to_body_velocity(q, w)])
 
 
-#: Fraction of a step between the rates whose parabola has their change by the time alone.
-_RATE_DISTANCE: Final = 1e-3
-
-
 class RosenbrockAttempts(RungeKuttaAttempts):
     """Attempts of rodas5 on y = (q, v), with quaternions as four numbers, whose length the exact flow keeps.
 
@@ -492,7 +485,8 @@ class RosenbrockAttempts(RungeKuttaAttempts):
         return k
 
     def _by_time(self, t: float, y: Array, h: float, there: Array) -> Array:
-        apart = _RATE_DISTANCE * h
+        # The parabola through three rates near each other has their change by the time alone.
+        apart = 1e-3 * h
         near, far = self._rate(t + apart, y), self._rate(t + 2 * apart, y)
         return (4 * near - far - 3 * there) / (2 * apart)
 

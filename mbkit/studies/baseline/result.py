@@ -8,13 +8,13 @@ from typing import Final, Literal
 
 import numpy as np
 
+from mbkit._check import MAX_LINES
 from mbkit.studies.baseline.description import Change
 from mbkit.studies.document import Bullet, Document, Items, Style, to_text
 from mbkit.studies.results import Refusal, ResultTable, columns_of, counted
 
 Status = Literal["same", "versions", "numbers", "description", "skipped"]
 # A person acts on the first few; the rest is in the data.
-_MAX_NUMBERS_SHOWN: Final = 5
 _MAX_CHANGES_SHOWN: Final = 20
 _MARKS: Final[dict[str, tuple[str, Style]]] = {
     "note": ("·", "muted"),
@@ -134,9 +134,9 @@ class BaselineResult(ResultTable):
     def lines(self, everything: bool = False) -> Iterator[tuple[str, str]]:
         """Iterate over the findings, gravest first: (subject, message).
 
-        Unless `everything` is set, the first 20 parameters and of each engine the 5 numbers that are off most.
+        Unless `everything` is set, the first 20 parameters and of each engine the 8 numbers that are off most.
         """
-        most = len(self.moved) if everything else _MAX_NUMBERS_SHOWN
+        most = len(self.moved) if everything else MAX_LINES
         shown = self.changes if everything else self.changes[:_MAX_CHANGES_SHOWN]
         for change in shown:
             yield "description", change.text

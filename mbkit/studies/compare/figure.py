@@ -21,7 +21,7 @@ from mbkit.simulate.plotting.style import (
 )
 from mbkit.studies.compare.terms import Row, by_term
 from mbkit.studies.formatting import error_text, time_text
-from mbkit.studies.svg import PAGE, PAGE_WIDTH_INCHES, page_style, svg
+from mbkit.studies.svg import PAGE, PAGE_WIDTH_INCHES, PANELS_PER_ROW, page_style, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -103,7 +103,6 @@ def shown_error(error: float, least: float) -> float:
 
 #: Smaller errors are drawn here, where double precision tells nothing.
 _MIN_DRAWN_ERROR: Final = EPS / 64
-_PANELS_PER_ROW: Final = 5
 
 
 def term_costs(rows: Sequence[Row], engines: Sequence[str], tolerance: float) -> str:
@@ -118,7 +117,7 @@ def term_costs(rows: Sequence[Row], engines: Sequence[str], tolerance: float) ->
     terms = list(dict.fromkeys(r.term for r in timed))
     if not terms:
         return ""
-    columns = min(_PANELS_PER_ROW, len(terms))
+    columns = min(PANELS_PER_ROW, len(terms))
     lines = math.ceil(len(terms) / columns)
     with page_style("term costs"):
         fig = new_figure(PAGE_WIDTH_INCHES, 1.0 + 1.55 * lines)

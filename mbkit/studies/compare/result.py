@@ -10,7 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from mbkit._check import DOUBLE_BITS, by_key
+from mbkit._check import DOUBLE_BITS, MAX_LINES, by_key
+from mbkit.engines.base import MAX_NAMES
 from mbkit.engines.constrained import off_by
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.simulate.plotting.style import drawing
@@ -233,9 +234,6 @@ def omission_blocks(omissions: Sequence[Omission]) -> list[doc.Block]:
     return [doc.Table(columns, omissions), doc.Items(chosen, on="terminal")]
 
 
-_MAX_FAILURES: Final = 12
-#: Stiff joints that have a line of their own on the first screen.
-_MAX_STIFF: Final = 3
 _ROLLOUTS: Final = "Rollouts against MuJoCo's own, step {}: largest difference of q (rad or m)"
 _MEASURED: Final = (
     "At each state a vector x of the reference and its error e give ‖e‖ / max(‖x‖, ‖M‖‖v‖²): a term that happens to be "
@@ -497,7 +495,8 @@ class Comparison(ResultTable):
     def _first_screen(self, *, full: bool) -> list[doc.Block]:
         """Return what a reader needs to know before any table."""
         stiff = [x for x in self.findings if x.kind == STIFF]
-        less = [] if full else stiff[_MAX_STIFF:]
+        # Few stiff joints have a line of their own on the first screen.
+        less = [] if full else stiff[MAX_NAMES:]
         beside = [doc.Bullet(x.kind, x.says, "!", "allowed") for x in self.findings if x not in less]
         if less:
             rest = ", ".join(name for x in less for name in x.joints)
@@ -513,8 +512,8 @@ class Comparison(ResultTable):
             failed = self.precision.failed
             beside += [doc.Bullet(f"no curve of {b.head}", b.text, "!", "allowed") for b in failed_curves(failed)]
         return [
-            doc.Items(failures(self.rows, self.rollouts, self.omissions), most=_MAX_FAILURES),
-            doc.Items(beside, most=_MAX_FAILURES),
+            doc.Items(failures(self.rows, self.rollouts, self.omissions), most=MAX_LINES),
+            doc.Items(beside, most=MAX_LINES),
             doc.Table(WORST, self._worst_rows()),
             *([] if full else [doc.Paragraph(doc.Span(_MORE, "muted"), on="terminal")]),
         ]

@@ -337,8 +337,6 @@ def announced(caught: Iterable[warnings.WarningMessage]) -> str:
 
 
 #: Limits of the `work_precision` in a comparison: a short horizon, few timings, runs of little work.
-_HORIZON_SECONDS: Final = 0.5
-_TIMINGS: Final = 3
 _MAX_EVALUATIONS: Final = 6_000
 _MAX_SECONDS: Final = 60.0
 
@@ -434,8 +432,8 @@ def _beyond_terms(
         movers, _, _, _ = _build(moving, tuple(engines), silent, compile=True)
     methods = {engine: shown for engine in movers if (shown := find_engine(engine).shown)}
     settings: dict[str, Any] = {
-        "duration": _HORIZON_SECONDS,
-        "repeats": _TIMINGS,
+        "duration": 0.5,
+        "repeats": 3,
         "seconds": _MAX_SECONDS,
         "work": _MAX_EVALUATIONS,
     }

@@ -51,8 +51,6 @@ _OF_END: Final = ("body", "rotation", "translation")
 _ROUNDED_DIFFERENCE: Final = 2e-5
 #: Most differences that are never summarized as rounding.
 _MAX_LISTED_ALONE: Final = 4
-#: kg/m³.
-_WATER_DENSITY: Final = 1000.0
 _DEGREE: Final = np.pi / 180
 #: URDF's order of an inertia's six numbers, and MuJoCo's.
 _URDF: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -240,9 +238,9 @@ def body_mistakes(links: Sequence[LinkInBody], R_PJ: Array, *, base: bool = Fals
         (m, "has the inertia of a ball of water of its mass"),
         (1.0, "has a ball of water of 1 kg in its place"),
     ):
-        # Drake's substitute for inconsistent matter.
+        # Drake's substitute for inconsistent matter: a ball of water.
         if mass > 0:
-            radius = (mass / (4 / 3 * np.pi * _WATER_DENSITY)) ** (1 / 3)
+            radius = (mass / (4 / 3 * np.pi * 1000.0)) ** (1 / 3)
             rows.append(("replaced inertia", says, {"mass": mass, "inertia": 0.4 * mass * radius**2 * np.eye(3)}))
     rows += [
         x for unit, name in (("mass", "mass"), ("inertia", "inertia")) for x in _units(unit, name, getattr(at, name))

@@ -34,8 +34,6 @@ from mbkit.studies.results import to_plain
 
 #: Parts of any kind are compared by their fields.
 EXPLAIN: Final = Path("explain", "explain compares bodies and joints of", frozenset(EFFECTS))
-#: Time at which forces of the time are compared, s.
-_MOMENT_S: Final = 0.37
 
 
 def explain(
@@ -109,7 +107,7 @@ def _model(x: Model | Dynamics, which: str) -> Model:
 
 def _moment(*models: Model) -> float:
     """Return a time at which nothing begins, and which the tables of motions have."""
-    intervals = [(_MOMENT_S, _MOMENT_S), *(x.interval for x in models)]
+    intervals = [(0.37, 0.37), *(x.interval for x in models)]
     return min(max(first for first, _ in intervals), *(last for _, last in intervals))
 
 

@@ -321,10 +321,6 @@ _SHORT_RUN_SECONDS: Final = 5e-3
 _SHORT_RUN_TIMINGS: Final = 3
 #: Methods that another may switch to, which are compiled before it is timed.
 _SWITCHES_TO: Final = {AUTOMATIC_METHOD: (ADAPTIVE_METHOD, STIFF_METHOD)}
-#: The time limit of an untimed run, which compiles what it needs on its way, over a timed one's.
-_UNTIMED_PER_RUN_TIME: Final = 2.0
-#: The part of an interval that is integrated to compile a method; steps are few in it, however stiff the system.
-_COMPILING_INTERVAL_PART: Final = 1e-15
 #: Steps of an engine's own integrator from which the time of all steps is estimated.
 _TRIAL_STEPS: Final = 2000
 
@@ -442,12 +438,13 @@ def _integrate(
 
     report_stage("method")
     try:
-        short = _COMPILING_INTERVAL_PART * float(times[1]) if adaptive else dt
+        # Steps are few in so short an interval, however stiff the system.
+        short = 1e-15 * float(times[1]) if adaptive else dt
         for name in (*_SWITCHES_TO.get(method, ()), method):
             run(short, name)
         if method in _SWITCHES_TO:
             # The controller's own functions are compiled when it first uses them.
-            run(duration, method, save=times, seconds=_UNTIMED_PER_RUN_TIME * limits.seconds)
+            run(duration, method, save=times, seconds=2.0 * limits.seconds)
         report_stage("run")
         steps = round(duration / dt) if kind.kind == "native" else 0
         if steps >= 2 * _TRIAL_STEPS:

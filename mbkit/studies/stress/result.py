@@ -11,7 +11,7 @@ from functools import partial
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 
-from mbkit._check import real
+from mbkit._check import MAX_LINES, real
 from mbkit.engines.base import MAX_NAMES
 from mbkit.errors import require_known
 from mbkit.model.validation import listing
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: A terminal names so many methods that were wrong in silence.
-_MAX_SILENT_METHODS: Final = 6
 #: The words before a truth's floor.
 _KNOWN: Final = "; known to "
 _MEASURES: Final = {
@@ -185,7 +183,7 @@ class StressResult(ResultTable):
             sections=[
                 Section("Who holds furthest, and what breaks first", [Table(shown, self.cases), drawn, key]),
                 Section("Where another held further than auto", [Items(list(_behind_bullets(self.cases)))]),
-                Section("Wrong in silence, and the mildest value where", [Items(silent, most=_MAX_SILENT_METHODS)]),
+                Section("Wrong in silence, and the mildest value where", [Items(silent, most=MAX_LINES)]),
                 *(_case_section(case, "both" if full else "page") for case in self.cases),
             ],
             result=self,

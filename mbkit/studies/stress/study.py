@@ -40,7 +40,6 @@ from mbkit.studies.worker import CallError, Worker, WorkerPool, check_executor, 
 #: Seconds of a run and of the whole study, quick and not.
 _RUN_SECONDS: Final = {True: 0.5, False: 2.0}
 _STUDY_SECONDS: Final = {True: 100.0, False: 1700.0}
-_WORKER_BYTES: Final = 2 * 2**30
 #: Below it no worker starts, bytes.
 _MIN_WORKER_BYTES: Final = 2**29
 _MAX_JOBS: Final = 16
@@ -48,14 +47,8 @@ _MAX_JOBS: Final = 16
 _MIN_RUN_SECONDS: Final = 0.1
 #: A row is over after so many runs in a row that did not finish.
 _MAX_FAILURES_IN_A_ROW: Final = 2
-#: The part of a truth's time that its search gets, and the time for making its engines besides, s.
-_SEARCH_PART: Final = 0.7
-_MIN_TRUTH_SECONDS: Final = 2.0
 #: Seconds for terms with 34 digits at one value, for which there is no substitute.
 _TERMS_SECONDS: Final = 60.0
-#: The worker may miss a limit by these seconds and this part of it before its process is ended.
-_GRACE_SECONDS: Final = 0.5
-_GRACE_PART: Final = 0.25
 #: Stage of a call -> what to add to the note of a process that ended there.
 _DURING: Final = {
     "": ", making the problem",
@@ -182,8 +175,9 @@ class CaseSweep:
                 return False
             self.report(f"{self.case.name}: truth at {self.case.parameter} = {value:g}")
             share = left / (len(self.values) - i)
-            seconds = _TERMS_SECONDS if self.case.measure == "terms" else share + _MIN_TRUTH_SECONDS
-            answer = self._call(worker, value, prepare, self.bar, _SEARCH_PART * share, truth=seconds)
+            # A search has the most of a truth's time, and making its engines some seconds besides.
+            seconds = _TERMS_SECONDS if self.case.measure == "terms" else share + 2.0
+            answer = self._call(worker, value, prepare, self.bar, 0.7 * share, truth=seconds)
             if isinstance(answer, Measurement):
                 answer = Prepared(f"no truth: {answer.note}") if worker.stage else Prepared(answer.note, failure=answer)
             self._prepared[i] = answer
@@ -243,7 +237,7 @@ class CaseSweep:
 
 def _with_grace(seconds: float) -> float:
     """Return the processor time after which a process is ended that should have stopped by itself."""
-    return seconds * (1 + _GRACE_PART) + _GRACE_SECONDS
+    return 1.25 * seconds + 0.5
 
 
 # All cases side by side
@@ -414,7 +408,7 @@ def stress(
         real("rtol", rtol, positive=True),
     )
     bar = real("bar", bar, positive=True)
-    memory = _WORKER_BYTES if memory is None else count("memory", memory, least=_MIN_WORKER_BYTES)
+    memory = 2 * 2**30 if memory is None else count("memory", memory, least=_MIN_WORKER_BYTES)
     budget = _STUDY_SECONDS[quick] if budget is None else real("budget", budget, positive=True)
     width = min(cores(), _MAX_JOBS) if jobs is None else count("jobs", jobs, least=1)
     check_executor(executor)

@@ -22,7 +22,7 @@ from mbkit.simulate.plotting.style import (
     new_figure,
 )
 from mbkit.studies.measurement import Measurement
-from mbkit.studies.svg import PAGE_WIDTH_INCHES
+from mbkit.studies.svg import PAGE_WIDTH_INCHES, PANELS_PER_ROW
 from mbkit.studies.work_precision.sweep import Curve, pareto_front
 
 if TYPE_CHECKING:
@@ -35,15 +35,10 @@ _Measure = Callable[[Measurement], float]
 
 #: MuJoCo's own integrators stand in the panel of the same formula.
 _SAME_FORMULA: Final = {m.name: m.own for m in METHODS.values() if m.own}
-_PANELS_PER_ROW: Final = 5
-_TOP_HEIGHT_INCHES: Final = 4.4
-_PANEL_HEIGHT_INCHES: Final = 1.5
 #: A run with a larger error, rad or m, is not on the front; with ten times as much it is not drawn.
 MAX_USEFUL_ERROR: Final = 0.1
 _MAX_DRAWN_ERROR: Final = 1.0
 _MIN_DRAWN_ERROR: Final = 1e-17
-#: Part of the decades of run time that the front's names have at the left, where nothing else can be.
-_NAMES_PART: Final = 0.35
 
 
 def figure(
@@ -60,8 +55,9 @@ def figure(
             drawn.errors(only, own=False)
             return figure_of(only)
         methods = drawn.methods()
-        rows = math.ceil(len(methods) / _PANELS_PER_ROW)
-        heights = [_TOP_HEIGHT_INCHES, *([0.3 + _PANEL_HEIGHT_INCHES * rows] if rows else [])]
+        rows = math.ceil(len(methods) / PANELS_PER_ROW)
+        # Inches of the first part, and of each row of panels.
+        heights = [4.4, *([0.3 + 1.5 * rows] if rows else [])]
         fig = new_figure(PAGE_WIDTH_INCHES, sum(heights))
         parts = fig.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
         # With dampers the energy is not conserved, and there is no drift to show.
@@ -77,7 +73,7 @@ def figure(
             if any(c.method in _SAME_FORMULA for some in methods.values() for c in some):
                 caption += "; dashed: MuJoCo's own integrator of the same formulas"
             parts[1].suptitle(caption, x=0.01, ha="left", fontsize=10.0)
-            grid = parts[1].subplots(rows, _PANELS_PER_ROW, sharex=True, sharey=True, squeeze=False)
+            grid = parts[1].subplots(rows, PANELS_PER_ROW, sharex=True, sharey=True, squeeze=False)
             drawn.by_method(list(grid.flat), methods)
     return fig
 
@@ -163,7 +159,8 @@ class _Drawing:
             best = _front([place for place in places if place[2].engine == engine], floor)
             look: dict[str, Any] = {"color": self.palette.engine(engine), "marker": engine_mark(engine)}
             name_points(ax.plot(*_xy(best), markersize=4.5, linewidth=2.0, **look), map(_text, best))
-        self.scale(ax, places, floor, _NAMES_PART if front else 0.0)
+        # The front's names have room at the left, where nothing else can be.
+        self.scale(ax, places, floor, 0.35 if front else 0.0)
         for k, curve in enumerate(reversed(front.values())):
             font: dict[str, Any] = {"color": self.palette.engine(curve.engine), "fontsize": 9.0, "fontweight": "bold"}
             ax.text(0.02, 0.03 + 0.06 * k, one_line(curve.method, 30), transform=ax.transAxes, **font)
@@ -195,6 +192,6 @@ class _Drawing:
             ax.set_title(one_line(method, 30), loc="left", fontsize=9.5, pad=3)
             self.scale(ax, places, self.floor, ticks=5)
             # The last of a column, whose lower neighbours may be missing.
-            ax.tick_params(labelsize=8.5, labelbottom=k + _PANELS_PER_ROW >= len(methods))
+            ax.tick_params(labelsize=8.5, labelbottom=k + PANELS_PER_ROW >= len(methods))
         for ax in panels[len(methods) :]:
             ax.remove()

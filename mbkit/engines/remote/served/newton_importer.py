@@ -28,8 +28,6 @@ _NUMBERS = {
 }
 #: Those of joints of several velocities too.
 _OF_ALL = ("armature", "damping", "friction")
-#: A limit beyond this is none.
-_NO_LIMIT = 1e5
 
 
 class Imported(Engine):  # type: ignore[misc]  # of the file beside
@@ -100,7 +98,8 @@ class _Description:
         held = {k: getattr(m, x, None) for k, x in _NUMBERS.items()}
         self._of = {k: x.numpy().astype(float) for k, x in held.items() if x is not None}
         for some in (x for k, x in self._of.items() if "limit" in _NUMBERS[k]):
-            some[np.abs(some) > _NO_LIMIT] *= np.inf
+            # A limit beyond this is none.
+            some[np.abs(some) > 1e5] *= np.inf
         sizes = ("joint_q_start", m.joint_coord_count), ("joint_qd_start", m.joint_dof_count)
         #: Where each joint's coordinates and velocities begin, and the last ones end.
         self._starts = [[*getattr(m, x).numpy().tolist()[: m.joint_count], n] for x, n in sizes]

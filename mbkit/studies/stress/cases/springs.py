@@ -22,8 +22,6 @@ _RANGE: Final = (powers(0, 12, 2), (1.0, 1e4, 1e8, 1e12))
 _joint = partial(case, "stiffness", "stiffness", "N m/rad", *_RANGE)
 _point = partial(case, "stiffness", "stiffness", "N/m", *_RANGE)
 
-#: The error of slow motions by collocation, measured against Taylor series with 34 digits.
-_SLOW_FLOOR: Final = 1e-11
 #: How far along the imaginary and the negative real axis the 8th order of Dormand and Prince 8(5,3) is stable: its
 #: stability polynomial is that of exp to z⁸, with four coefficients of its own behind. From the
 #: coefficients in Hairer, Nørsett, Wanner 1993, II.10.
@@ -82,7 +80,8 @@ def _slow(
     source = f"collocation in the angle and the spring's {name}, Radau IIA of order 15"
     scale = np.array([1.0, stiffness])
     q = np.array([1.0, carried]) / scale
-    return motion(model, q, 0.0, duration, lambda t: solved(t)[:, :2] / scale, _SLOW_FLOOR, source, facts=facts)
+    # The floor is the error by collocation, measured against Taylor series with 34 digits.
+    return motion(model, q, 0.0, duration, lambda t: solved(t)[:, :2] / scale, 1e-11, source, facts=facts)
 
 
 @_joint()
@@ -241,9 +240,6 @@ def flexible_appendage(stiffness: float) -> Problem:
 # - Runge-Kutta of order 4 in 4 stages: λ = 1 + z + z²/2 + z³/6 + z⁴/24 at both roots z of z² + 2ζx z + x²
 # - Gauss's, the midpoint rule, and Euler with damper and spring implicit: every x.
 
-#: How far RK4 is stable along the imaginary axis, and along the negative real one: the root of 24 + 12 z + 4 z² + z³.
-_RK4_IMAGINARY: Final = 2 * math.sqrt(2)
-_RK4_REAL: Final = 2.785293563405282
 
 _EXPLICIT: Final = ("semi_implicit_euler", "mujoco_euler")
 _DAMPER_IMPLICIT: Final = ("mujoco_implicit", "mujoco_implicitfast")
@@ -258,9 +254,10 @@ def largest_step(_engine: str, method: str, *, frequency: float, damping: float)
     if method in _DAMPER_IMPLICIT:
         return 2 * (math.sqrt(damping**2 + 1) + damping) / frequency
     if method in ("rk4", "mujoco_rk4"):
+        # Its limits on the imaginary and on the negative real axis; the second is the root of 24 + 12 z + 4 z² + z³.
         if damping == 0:
-            return _RK4_IMAGINARY / frequency
-        return _RK4_REAL / (frequency * (damping + math.sqrt(damping**2 - 1)))
+            return 2 * math.sqrt(2) / frequency
+        return 2.785293563405282 / (frequency * (damping + math.sqrt(damping**2 - 1)))
     return math.inf if method in _UNLIMITED else None
 
 
