@@ -26,9 +26,9 @@ from mbkit.engines.base import QUANTITIES, Dynamics
 from mbkit.engines.constrained import ASKED
 from mbkit.engines.constraint_manifold import Manifold, require_few
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.engines.steps import MAX_NEWTON_ITERATIONS
 from mbkit.errors import InputError, NumericalError, require_known
 from mbkit.lagrangian.energy_model import abstract_parts
+from mbkit.methods.one_step import MAX_NEWTON_ITERATIONS
 from mbkit.model import Model
 from mbkit.model.elements.paths import ALL, Path
 
