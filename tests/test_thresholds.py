@@ -1,0 +1,450 @@
+"""Thresholds that decide between two sides: each has a scene that holds at its value, and neither at a tenth nor at ten.
+
+`python -m validation.thresholds` lists all; tests elsewhere name those that need a whole study.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace as Stub
+from typing import Any
+
+import numpy as np
+import pytest
+import sympy as sp
+from numpy.polynomial import Polynomial
+
+import mbkit as mb
+from mbkit import _check
+from mbkit._check import EPS
+from mbkit.catalog import _system
+from mbkit.derivation import constraints
+from mbkit.derivation.steps.onto_constraints import nears_singular
+from mbkit.engines.constrained import singular_pose
+from mbkit.errors import InputError, MbkitError, ModelError, nearest
+from mbkit.lagrangian import printer
+from mbkit.lagrangian.continua.beam import clamped_free
+from mbkit.lagrangian.energies import sympy_to_casadi
+from mbkit.lagrangian.trig import simplify
+from mbkit.load import loader, xml_reader
+from mbkit.methods import METHODS, one_step
+from mbkit.model import base_parameters, manifold, validation
+from mbkit.model.builder import ArgumentReader
+from mbkit.model.elements import beams, motion_laws
+from mbkit.model.quaternions import FLOATS
+from mbkit.show import meshes
+from mbkit.simulate import checks, time_grid
+from mbkit.simulate.solvers import vector_field
+from mbkit.simulate.stiffness_measure import Stiffness
+from mbkit.studies import formatting, lint
+from mbkit.studies.baseline import description, file
+from mbkit.studies.baseline import study as baseline
+from mbkit.studies.baseline.result import BaselineResult
+from mbkit.studies.compare.result import omission_state
+from mbkit.studies.explain import hypotheses
+from mbkit.studies.measurement import Measurement
+from mbkit.studies.stress.study import _Row
+from mbkit.studies.work_precision import sweep
+from tests.scenes import chain, hinge, slider
+
+
+def accepts(call: Callable[..., Any], *arguments: Any, **named: Any) -> bool:
+    try:
+        call(*arguments, **named)
+    except MbkitError:
+        return False
+    return True
+
+
+# Descriptions
+
+
+def two_sliders(light: float) -> mb.Model:
+    links = ({"mass": m, "kind": "prismatic", "axis": (1, 0, 0)} for m in (light, 1.0))
+    return chain(*links, gravity=(0, 0, 0)).build()
+
+
+def small_wheel(inertia: float) -> mb.Model:
+    wheel = {"mass": 1.0, "inertia": (inertia,) * 3, "axis": (0, 1, 0), "translation": (1, 0, 0)}
+    return chain({"kind": "prismatic", "mass": 1.0, "axis": (1, 0, 0)}, wheel).build()
+
+
+def place(length: float) -> bool:
+    reader = ArgumentReader()
+    reader.place("translation", (length, 0, 0))
+    return not reader.faults
+
+
+def quaternion(off: float) -> bool:
+    model = mb.catalog.free_body()
+    return accepts(model.check_q, model.neutral() + np.eye(7)[6] * off)
+
+
+def warns(call: Callable[..., Any], *arguments: Any) -> bool:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        call(*arguments)
+    return bool(caught)
+
+
+def names_bodies(count: int) -> bool:
+    b = hinge()
+    for k in range(count):
+        b.add_body(f"b{k}", mass=1.0)
+    b.add_joint("k", "revolute", parent="a", child="zzz")
+    try:
+        b.build()
+    except ModelError as error:
+        return "there are:" in str(error)
+    raise AssertionError
+
+
+def too_many(velocities: int) -> bool:
+    class Rest(Stub):
+        def __getattr__(self, name: str) -> Any:
+            raise InputError(name)
+
+    joints = (Stub(type=Stub(nv=velocities)),)
+    return accepts(lambda: next(validation.structure_faults(Rest(bodies=(Rest(),), joints=joints))))
+
+
+def few_knots(count: int) -> bool:
+    part = Stub(knots=np.arange(float(count)), coefficients=np.zeros((4, count - 1)))
+    return "up to" not in next(motion_laws._spline_faults("t", part), "")
+
+
+# Files
+
+
+def toml(size: int) -> bool:
+    Path("loops.toml").write_text("#" * (size - 1) + "\n")
+    try:
+        loader.read_loops("loops.toml")
+    except MbkitError as error:
+        return "no table" in str(error)
+    raise AssertionError
+
+
+def listed(count: int) -> bool:
+    folder = Path(f"of{count}")
+    folder.mkdir(exist_ok=True)
+    for k in range(count):
+        (folder / f"{k}.urdf").touch()
+    return "and more" in xml_reader._descriptions(folder)
+
+
+def long_name(size: int) -> bool:
+    reader = xml_reader.Reader.__new__(xml_reader.Reader)
+    reader.faults = []
+    reader.name(xml_reader.Element("link", {"name": "n" * size}, 1), "name", "link")
+    return not reader.faults
+
+
+# Expressions
+
+
+def condition_of_rates(condition: float) -> bool:
+    equations: Any = Stub(linear=lambda *_: (None, np.ones((1, 1, 1)), np.full((1, 1, 1), condition)))
+    return accepts(sympy_to_casadi.VelocityMap.check_start, equations, np.zeros(1), np.zeros(1))
+
+
+def sum_of(count: int) -> sp.Expr:
+    return sp.Add(*sp.symbols(f"a:{count}"))
+
+
+def abbreviated(operations: int, occurrences: int) -> bool:
+    base = sum_of(operations + 1)
+    return bool(printer.Abbreviations([sp.sqrt(base)] * occurrences, []).roots)
+
+
+def power_is_one(exponent: int) -> bool:
+    simplify.tidy.cache_clear()
+    x = sp.Symbol("x")
+    return bool(simplify.tidy(sp.Pow(sp.sin(x) ** 2 + sp.cos(x) ** 2, exponent)) == 1)
+
+
+def tidied(operations: int) -> bool:
+    simplify.tidy.cache_clear()
+    x = sp.Symbol("x")
+    return not simplify.tidy_short(sp.sin(x) ** 2 + sp.cos(x) ** 2 + sum_of(operations - 4)).has(sp.sin)
+
+
+# Runs
+
+SPRING = slider(stiffness=1.0).build()
+
+
+def still_and_moved(speed: float, way: float) -> bool:
+    q, v = np.array([[[0.0], [way]]]), np.array([[[speed], [speed]]])
+    return not any(checks.travel(q, v, checks.Tolerances(1e-9, 1e-9)))
+
+
+def decaying(time: float) -> bool:
+    return checks.lost([np.exp(-1e-3 / time) * 1.01], 1e-3, np.array([-1 / time]), 1.0)[0] > 0
+
+
+def follows(method: str, h: float, duration: float) -> bool:
+    dyn, q = mb.dynamics(SPRING, "lagrangian", compile=False), np.ones((1, 1))
+    return not any(checks.step_size(dyn, METHODS[method], h, duration, q, np.zeros((1, 1))))
+
+
+def rushes(h: float) -> bool:
+    dyn, q = mb.dynamics(SPRING, "lagrangian", compile=False), np.ones((1, 1, 1))
+    return checks._rushes(dyn, METHODS["semi_implicit_euler"], h, q, q)
+
+
+def moves_mass(least: float) -> bool:
+    model = two_sliders(1.0)
+    dyn: Any = Stub(model=model, _samples=None, mass_matrix=lambda q: np.diag([1.0, 1.0 if q.any() else least]))
+    return not checks.massless_joints(dyn, np.zeros(2))
+
+
+def half_step_differs(h: float) -> bool:
+    dyn = mb.dynamics(SPRING, "lagrangian", compile=False)
+    run = mb.simulate(dyn, [1.0], [0.0], 2.0, "semi_implicit_euler", h)
+    return "first order" in str(run.check())
+
+
+# Studies
+
+
+def points(errors: list[float], floor: float = 0.0, motion: float = 1e6) -> bool:
+    steps = [0.1 / 4**k for k in range(len(errors))]
+    return sweep.observed_order(steps, errors, floor=floor, motion=motion).points == 4
+
+
+def slopes(*of: float) -> list[float]:
+    return np.exp(-np.cumsum([0.0, *of]) * np.log(4)).tolist()
+
+
+def settled(*cells: tuple[float, int]) -> bool:
+    return sweep.gains_nothing([Measurement(1.0, error=e, steps=n) for e, n in cells], 0.0)
+
+
+def turned(ratio: float) -> bool:
+    cells = (Measurement(0.1, error=1.0, setting="dt"), Measurement(0.05, error=ratio, setting="dt"))
+    return sweep.Curve.turn.fget(Stub(points=cells)) is not None
+
+
+def stops_after(failures: int) -> bool:
+    row = _Row("e", "m", "dt", None)
+    for k in range(failures):
+        row.add(k, Measurement(float(k), end="diverged"))
+    return bool(row.stopped)
+
+
+def changes_shown(count: int) -> bool:
+    result: Any = Stub(
+        changes=[Stub(text="t")] * count, effect="", moved=(), versions=(), processors=("", ""), skipped=(), notes=()
+    )
+    return ("description", "and 1 more") in list(BaselineResult.lines(result))
+
+
+def rollout_steps(steps: int) -> bool:
+    texts = dict.fromkeys(("model", "digest", "target", "processor"), "x")
+    b: Any = Stub(**texts, states=Stub(kinds=()), versions={}, errors={}, seed=0, rollout=Stub(steps=steps))
+    try:
+        file._check(b)
+    except ValueError as error:
+        return "steps" not in str(error)
+    return True
+
+
+def copied(count: int) -> bool:
+    links = [{"mass": 1.0 + k, "inertia": (0.1, 0.2, 0.25), "axis": (0, 1, 0)} for k in range(count)]
+    return any(f.check == "copied inertia" for f in mb.lint(chain(*links).build()).rows)
+
+
+def turn(angle: float) -> bool:
+    return bool(description._turn(np.eye(3).ravel(), mb.spatial.matrix_from_rpy(angle, 0.0, 0.0).ravel()))
+
+
+#: Module and name -> what decides, and a number on either side of the threshold.
+DECIDES: dict[str, tuple[Callable[[Any], object], Any, Any]] = {
+    "catalog._system:_MAX_COUNT": (lambda x: accepts(_system.count, "n", x), 2000, 2001),
+    "derivation.constraints:_SINGULAR": (lambda x: constraints.singular_mass_matrix(two_sliders(x)), 1e-9, 8e-9),
+    "derivation.steps.onto_constraints:STEPS_TO_POSE": (lambda x: bool(nears_singular(1.0, x)), 1.4, 1.8),
+    "engines.constrained:TAKES_PART": (
+        lambda x: (
+            "row b"
+            in str(singular_pose("", "", ["row a", "row b", "row c"], np.array([[1.0, 0.0], [0.0, 1.0], [1.0, x]])))
+        ),
+        0.05,
+        0.2,
+    ),
+    "errors:_MAX_FAULTS": (lambda x: ".faults holds all" in str(ModelError("m", ["f"] * x)), 100, 101),
+    "errors:_LONGEST_NAME": (lambda x: bool(nearest("x" * x, ["x" * x + "y"])), 200, 201),
+    "lagrangian.continua.beam:MAX_MODES": (lambda x: accepts(clamped_free, x, sp.Symbol("x"), 1), 20, 21),
+    "lagrangian.energies.sympy_to_casadi:MAX_SHOWN_LETTERS": (
+        lambda x: sympy_to_casadi._short("x" * x).endswith("..."),
+        200,
+        201,
+    ),
+    "lagrangian.energies.sympy_to_casadi:_SINGULAR_CONDITION": (condition_of_rates, 3e11, 3e12),
+    "lagrangian.printer:MAX_DENOMINATOR": (lambda x: "/" in printer._number(sp.Rational(1, x)), 10_000, 10_001),
+    "lagrangian.printer:_MIN_ROOT_OPERATIONS": (lambda x: abbreviated(x, 5), 3, 4),
+    "lagrangian.printer:_MIN_ROOT_OCCURRENCES": (lambda x: abbreviated(5, x), 2, 3),
+    "lagrangian.trig.simplify:_MAX_EXPONENT": (power_is_one, 12, 13),
+    "lagrangian.trig.simplify:_MAX_TIDIED_OPERATIONS": (tidied, 145, 155),
+    "load.loader:_MAX_TOML_BYTES": (toml, 1_000_000, 1_000_001),
+    "load.xml_reader:MAX_DEPTH": (lambda x: accepts(xml_reader.parse, b"<a>" * x + b"</a>" * x, "x"), 250, 251),
+    "load.xml_reader:_MAX_LISTED_FILES": (listed, 10, 11),
+    "load.xml_reader:MAX_NAME_LENGTH": (long_name, 1000, 1001),
+    "methods.one_step:MAX_GROWTH": (lambda x: one_step.elementary_factors(FLOATS, 1e-30, 1.0)[0] > x, 9.0, 11.0),
+    "methods.one_step:_SAFETY": (lambda x: one_step.elementary_factors(FLOATS, 1.0, 1.0)[0] > x, 0.7, 0.9),
+    "methods.one_step:_MIN_SHRINK": (
+        lambda x: one_step.next_step(FLOATS, (1.0, 1e-9, 1.0), False, 1.0, 1.0, 1.0, 1.0)[0] > x,
+        0.15,
+        0.25,
+    ),
+    "model.base_parameters:_PIVOT_RATIO": (
+        lambda x: base_parameters.eliminated(np.array([[1.0, x]]))[0] == [1],
+        0.05,
+        0.2,
+    ),
+    "model.builder:MAX_LENGTH": (place, 5e149, 5e150),
+    "model.elements.beams:_MAX_MODES": (
+        lambda x: accepts(beams.modes_of, x, None, string=True),
+        10,
+        11,
+    ),
+    "model.elements.beams:_MAX_POLYNOMIAL_DEGREE": (
+        lambda x: accepts(beams.modes_of, None, Polynomial(np.eye(x + 1)[x]), string=False),
+        20,
+        21,
+    ),
+    "model.elements.motion_laws:MAX_KNOTS": (few_knots, 2000, 2001),
+    "model.manifold:NEAR_UNIT": (quaternion, 4e-10, 4e-9),
+    "model.manifold:_COMMON_SIZE": (lambda x: manifold.magnitude(np.array([x])) > 1, 9.0, 11.0),
+    "_check:TWO_TURNS": (lambda x: warns(_check.hint_at_degrees, "q", x), 10.0, 15.0),
+    "model.model:_MAX_TURN_IN_A_STEP": (
+        lambda x: warns(hinge().build().check_q, [4 * np.pi + x]),
+        0.5,
+        2.0,
+    ),
+    "model.validation:_MAX_NAMES": (names_bodies, 30, 50),
+    "model.validation:_MAX_VELOCITIES": (too_many, 5000, 5001),
+    "model.validation:_MIN_MASS_OR_MOMENT": (
+        lambda x: bool(validation.scale_doubts(slider(mass=x).build())),
+        5e-15,
+        5e-14,
+    ),
+    "model.validation:_MAX_SIZE_RATIO": (lambda x: bool(validation.scale_doubts(small_wheel(x))), 5e-12, 5e-11),
+    "show.meshes:_MIN_CLUSTERED_TRIANGLES": (lambda x: len(clustered(x)) < x, 140, 160),
+    "simulate.checks:_MAX_ROUNDING": (
+        lambda x: any(checks.condition([np.array([[1.0, 1 - x], [1 - x, 1.0]])])),
+        2e-13,
+        2e-12,
+    ),
+    "simulate.checks:_MAX_POSITION_ERROR": (
+        lambda x: any(checks.coordinate_magnitude(np.array([[x]]), None)),
+        2e9,
+        2e10,
+    ),
+    "simulate.checks:_MIN_MOTION": (lambda x: still_and_moved(1.0, x), 5e-8, 2e-7),
+    "simulate.checks:_MAX_REST_VELOCITY": (lambda x: still_and_moved(x, 0.0), 1e-13, 1e-12),
+    "simulate.checks:_MAX_ERROR_SUM": (
+        lambda x: any(checks.accumulated_error("m", checks.Tolerances(1e-9, 1e-9), 1, x)),
+        5e5,
+        2e6,
+    ),
+    "simulate.checks:_TRANSIENT_SHARE": (decaying, 5e-3, 2e-2),
+    "simulate.checks:_MAX_MODE_LOSS": (lambda x: follows("implicit_midpoint", x, 10.0), 0.1, 0.25),
+    "simulate.checks:_MAX_FOLLOWED_STEP": (lambda x: follows("semi_implicit_euler", x, 1e8), 5e-4, 2e-3),
+    "simulate.checks:_MAX_HALVING_DIFFERENCE": (rushes, 2.0, 3.0),
+    "simulate.checks:_MAX_EIGENVALUE_RATIO": (moves_mass, 5e-8, 5e-7),
+    "simulate.trajectory:_MAX_GAP": (half_step_differs, 5e-3, 5e-2),
+    "simulate.time_grid:MAX_NUMBERS": (lambda x: accepts(time_grid.check_room, x, 2), 2**29, 2**29 + 1),
+    "simulate.solvers.vector_field:BOUND": (lambda x: bool(vector_field.is_bounded(np.array([x]))), 5e99, 5e100),
+    "simulate.stiffness_measure:_MIN_GROWTH_SHARE": (
+        lambda x: Stiffness(np.array([complex(x, 1.0)]), 1.0).stable > 0,
+        0.05,
+        0.2,
+    ),
+    "studies.baseline.description:_MAX_ROUNDINGS": (
+        lambda x: description._only_rounding("mass", np.ones(1), np.ones(1) + x * EPS),
+        32,
+        128,
+    ),
+    "studies.baseline.description:_LEAST_TURN_RAD": (turn, 5e-8, 5e-7),
+    "studies.baseline.file:_MAX_ROLLOUT_STEPS": (rollout_steps, 10_000, 10_001),
+    "studies.baseline.result:_MAX_CHANGES_SHOWN": (changes_shown, 20, 21),
+    "studies.baseline.study:FINE": (
+        lambda x: baseline._allowed(Stub(own={}, errors={"e": {"M": 0.0}}), "e", "M") > x * EPS,
+        100,
+        200,
+    ),
+    "studies.compare.result:_MIN_VISIBLE_CHANGE": (
+        lambda x: omission_state(Stub(change=x, fault="", present=True)),
+        5e-7,
+        5e-6,
+    ),
+    "studies.explain.hypotheses:_MAX_NUMBERS_SHOWN": (
+        lambda x: hypotheses._changed("f", np.zeros(x), np.ones(x), None).startswith("another"),
+        9,
+        10,
+    ),
+    "studies.formatting:_MAX_LISTED_LETTERS": (lambda x: len(formatting.missing_text(["a:" + "b" * x])) > 9, 78, 79),
+    "studies.lint.checks:LIKELY_FROM": (lambda x: lint.checks._confidence(x) == lint.checks.LOOK, 2.0, 4.0),
+    "studies.lint.checks:SURE_FROM": (lambda x: lint.checks._confidence(x) == lint.checks.SURE, 20.0, 40.0),
+    "studies.lint.checks:MIN_COPIES": (copied, 2, 3),
+    "studies.measurement:GROSS": (lambda x: Measurement(1.0, error=x).outcome(1e-6), 5e-3, 5e-2),
+    "studies.stress.study:_MAX_FAILURES_IN_A_ROW": (stops_after, 1, 2),
+    "studies.work_precision.sweep:_MAX_ERROR_PER_MOTION": (
+        lambda x: points([x, x / 16, x / 256, x / 4096], motion=1.0),
+        0.02,
+        0.05,
+    ),
+    "studies.work_precision.sweep:_MIN_ERROR_PER_FLOOR": (
+        lambda x: points([1.0, 0.1, 1e-2, 1e-3], floor=1e-3 / x),
+        50,
+        200,
+    ),
+    "studies.work_precision.sweep:_MAX_SLOPE_SPREAD": (lambda x: points(slopes(2, 2, 2 + x)), 0.2, 0.5),
+    "studies.work_precision.sweep:_MIN_TURNED_ERROR_RATIO": (turned, 1.2, 2.0),
+    "studies.work_precision.sweep:_MAX_SETTINGS_WITHOUT_GAIN": (
+        lambda x: settled(*[(1e-9, 100 * 2**k) for k in range(x + 1)]),
+        1,
+        2,
+    ),
+    "studies.work_precision.sweep:_MAX_CONVERGED_ERROR": (
+        lambda x: settled((x, 100), (0.95 * x, 200), (0.9 * x, 400)),
+        5e-7,
+        5e-6,
+    ),
+    "studies.work_precision.sweep:_MAX_SETTLED_SPREAD": (
+        lambda x: settled((1e-3, 100), (1e-3 * (1 - x / 2), 200), (1e-3 * (1 - x), 400)),
+        5e-3,
+        5e-2,
+    ),
+    "studies.work_precision.sweep:_MIN_STEPS_RATIO": (
+        lambda x: settled((1e-9, 1000), (1e-9, round(1000 * x)), (1e-9, round(1000 * x**2))),
+        1.15,
+        1.3,
+    ),
+}
+
+
+def clustered(count: int) -> np.ndarray:
+    angles = np.linspace(0, 2 * np.pi, count + 1)
+    vertices = np.array([(0, 0, 0), *zip(np.cos(angles), np.sin(angles), 0 * angles, strict=True)], dtype=float)
+    triangles = np.array([(0, k + 1, k + 2) for k in range(count)])
+    return meshes.thinned([meshes.Surface(vertices, triangles, None)], 20)[0].triangles
+
+
+@pytest.mark.parametrize("constant", DECIDES)
+def test_threshold_decides_between_its_two_sides(
+    constant: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    place, name = constant.split(":")
+    module, (decide, below, above) = import_module(f"mbkit.{place}"), DECIDES[constant]
+    assert decide(below) != decide(above)
+    value = getattr(module, name)
+    for changed in (max(value // 10, 1) if isinstance(value, int) else value / 10, value * 10):
+        with monkeypatch.context() as there:
+            there.setattr(module, name, changed)
+            assert decide(below) == decide(above), changed
