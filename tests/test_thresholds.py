@@ -1,6 +1,6 @@
-"""Thresholds that decide between two sides: each has a scene that holds at its value, and neither at a tenth nor at ten.
+"""Each threshold tells two numbers apart, one on either side; a tenth and ten times of it tell them apart no more.
 
-`python -m validation.thresholds` lists all; tests elsewhere name those that need a whole study.
+`python -m validation.thresholds` lists all thresholds; those that need a longer scene have tests of their own.
 """
 
 from __future__ import annotations
@@ -174,6 +174,7 @@ def tidied(operations: int) -> bool:
 
 # Runs
 
+ROWS = ["row a", "row b", "row c"]
 SPRING = slider(stiffness=1.0).build()
 
 

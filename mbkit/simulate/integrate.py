@@ -22,11 +22,10 @@ from mbkit.simulate import solvers
 from mbkit.simulate.checks import diagnostics, massless_joints
 from mbkit.simulate.constraint_projection import along_constraints, from_consistent
 from mbkit.simulate.events import as_events
-from mbkit.simulate.problem import RUNS, IntegrationProblem, RunRequest, Solver
+from mbkit.simulate.problem import RUNS, SIDE_BY_SIDE, IntegrationProblem, RunRequest, Solver
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.run_data import Acting, RunData, RunSettings, SolverResult
 from mbkit.simulate.singular_poses import describe_poses
-from mbkit.simulate.solvers.in_phases.fixed import SIDE_BY_SIDE
 from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, Indices, check_room, save_times
 from mbkit.simulate.torque import RunWrenches, Torque, TorqueFunction
 

@@ -52,6 +52,8 @@ class RunRequest:
 
 #: Runs whose jumps are those of phases, or of the method.
 RUNS: Final = Path("runs", "simulate: not known of", ALL)
+#: States side by side that machine code takes through a step in the time of one.
+SIDE_BY_SIDE: Final = 8
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from mbkit.methods.registry import method_of
 from mbkit.model.integration_space import Space
 from mbkit.model.parts import STOPPED
 from mbkit.simulate.events import Hit
-from mbkit.simulate.problem import IntegrationProblem, Solver
+from mbkit.simulate.problem import SIDE_BY_SIDE, IntegrationProblem, Solver
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.run_data import Ended, SolverResult
 from mbkit.simulate.singular_poses import SingularPoses
@@ -35,8 +35,6 @@ UNDECIDED: Final = "stopped, as which joints rest cannot be decided"
 _BLOCK: Final = 32
 #: Steps of states in the time of a block's set-up and of its changes, by machine code and in Python.
 _SET_UP: Final = {True: 2**13, False: 2**5}
-#: States side by side that machine code steps in the time of one.
-SIDE_BY_SIDE: Final = 8
 #: States of a block, at most.
 _MOST_STATES: Final = 2**16
 #: Fraction of a step before which the end of a phase is not searched.
