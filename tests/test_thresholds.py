@@ -22,7 +22,8 @@ from mbkit import _check
 from mbkit._check import EPS
 from mbkit.catalog import _system
 from mbkit.derivation import constraints
-from mbkit.derivation.steps.onto_constraints import nears_singular
+from mbkit.derivation.steps import onto_constraints
+from mbkit.engines.applications import random_states
 from mbkit.engines.constrained import singular_pose
 from mbkit.errors import InputError, MbkitError, ModelError, nearest
 from mbkit.lagrangian import printer
@@ -65,6 +66,24 @@ def accepts(call: Callable[..., Any], *arguments: Any, **named: Any) -> bool:
 def two_sliders(light: float) -> mb.Model:
     links = ({"mass": m, "kind": "prismatic", "axis": (1, 0, 0)} for m in (light, 1.0))
     return chain(*links, gravity=(0, 0, 0)).build()
+
+
+def two_carts() -> mb.Model:
+    """Return two sliders that a loop keeps together: f = q₀ - q₁."""
+    cart = {"mass": 1.0, "kind": "prismatic", "axis": (1, 0, 0), "parent": "world"}
+    b = chain(cart, cart, gravity=(0, 0, 0))
+    b.add_loop("pin", kind="point", body_a="b0", body_b="b1")
+    return b.build()
+
+
+def turned_frames(count: int, angle: float) -> mb.Model:
+    """Return hinges whose bodies are welded to the ground at an angle: half of all starts end half a turn away."""
+    hinges = [{"mass": 1.0, "inertia": (0.1,) * 3, "axis": (0, 0, 1), "parent": "world"}] * count
+    b = chain(*hinges, {"mass": 1.0, "kind": "prismatic", "axis": (1, 0, 0), "parent": "world"})
+    turned = mb.spatial.matrix_from_rpy(0, 0, angle)
+    for k in range(count):
+        b.add_loop(f"weld {k}", kind="frame", body_a=f"b{k}", body_b="world", rotation_b=turned)
+    return b.build()
 
 
 def small_wheel(inertia: float) -> mb.Model:
@@ -209,6 +228,71 @@ def half_step_differs(h: float) -> bool:
     return "first order" in str(run.check())
 
 
+# Constraints
+
+
+class OpenRows(constraints._Numbers):
+    """Rows q and a gap that nothing closes."""
+
+    def __init__(self, gap: float) -> None:
+        self.gap, self.model, self._parameters = gap, SPRING, []
+
+    def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([q[0], self.gap]), np.array([[1.0], [0.0]])
+
+    def _call(self, *_: Any) -> list[Any]:
+        return [None] * 3 + [1.0]
+
+
+def equations(model: mb.Model) -> Any:
+    return mb.dynamics(model, "lagrangian", compile=False).equations
+
+
+def has_closed(of: tuple[int, float]) -> bool:
+    return constraints._chosen_rows(turned_frames(*of)).closed is not None
+
+
+def projected(residual: float) -> bool:
+    _, _, moved, _ = onto_constraints.projection(equations(two_carts()))([0, residual], [0, 0], [0, 0])
+    return bool(np.any(moved))
+
+
+def far_in_one(aside: float) -> bool:
+    return bool(onto_constraints.quick_projection(equations(two_carts()))([0, 1e-8], [0, 0], [aside, aside])[2])
+
+
+def far_in_some(aside: float) -> bool:
+    model = mb.catalog.four_bar()
+    q, v = model.random_state(0)
+    return bool(onto_constraints.thorough_projection(equations(model))(q + aside * np.eye(3)[1], v)[2])
+
+
+def draws(refused: int) -> list[np.ndarray] | None:
+    """Return the configurations that were tried, None where the search gave up before the last one."""
+    tried: list[np.ndarray] = []
+
+    def flowed(_: Any, q: np.ndarray, v: np.ndarray, __: float) -> Any:
+        tried.append(q)
+        return (q, v) if len(tried) > refused else None
+
+    def give_up(*_: Any) -> None:
+        raise InputError
+
+    states = object.__new__(random_states.ConsistentStates)
+    dyn = Stub(model=slider().build())
+    states.manifold = Stub(dyn=dyn, equations=Stub(row_choice=Stub(closed=None)))
+    with pytest.MonkeyPatch.context() as there:
+        there.setattr(random_states, "flowed", flowed)
+        there.setattr(random_states, "require_independent", lambda *_: None)
+        there.setattr(random_states, "refuse_unreachable", give_up)
+        return tried if accepts(states.random, np.random.default_rng(0), None) else None
+
+
+def drawn_anywhere(k: int) -> bool:
+    rng, model = np.random.default_rng(0), slider().build()
+    return (draws(k) or [])[-1:] == [manifold.random_state(model, rng, None)[0] for _ in range(k + 1)][-1:]
+
+
 # Studies
 
 
@@ -267,7 +351,19 @@ def turn(angle: float) -> bool:
 DECIDES: dict[str, tuple[Callable[[Any], object], Any, Any]] = {
     "catalog._system:_MAX_COUNT": (lambda x: accepts(_system.count, "n", x), 2000, 2001),
     "derivation.constraints:_SINGULAR": (lambda x: constraints.singular_mass_matrix(two_sliders(x)), 1e-9, 8e-9),
-    "derivation.steps.onto_constraints:STEPS_TO_POSE": (lambda x: bool(nears_singular(1.0, x)), 1.4, 1.8),
+    "derivation.constraints:_CLOSED": (lambda x: OpenRows(x).closed(np.ones(1), [0, 1]) is None, 5e-14, 5e-13),
+    "derivation.constraints:_LOOKS": (has_closed, (3, 2.6), (4, 2.0)),
+    "derivation.constraints:_STARTS": (has_closed, (3, 2.6), (4, 2.0)),
+    "derivation.steps.onto_constraints:_MAX_RESIDUAL": (projected, 3e-16, 2e-15),
+    "derivation.steps.onto_constraints:_MAX_ERROR": (far_in_one, 4e-9, 4e-8),
+    "derivation.steps.onto_constraints:_ITERATIONS": (far_in_some, 1e-4, 2e-2),
+    "derivation.steps.onto_constraints:STEPS_TO_POSE": (
+        lambda x: bool(onto_constraints.nears_singular(1.0, x)),
+        1.4,
+        1.8,
+    ),
+    "engines.applications.random_states:_DRAWS": (lambda x: draws(x) is None, 49, 50),
+    "engines.applications.random_states:_ANYWHERE": (drawn_anywhere, 9, 11),
     "engines.constrained:TAKES_PART": (
         lambda x: (
             "row b"
