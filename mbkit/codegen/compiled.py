@@ -273,8 +273,9 @@ class KernelSequence:
         """Make the calls from `first` to before `last`, counted over the rounds; other Python threads run meanwhile."""
         self._runner.run(self._address, None, first, last)
 
-    def run_once(self) -> None:
-        """Make the calls of the first round."""
+    def run_once(self, states: int) -> None:
+        """Make the calls of the first round on the first of their states."""
+        self._list[4::_ENTRY_WORDS] = states
         self.run(0, len(self._calls))
 
 

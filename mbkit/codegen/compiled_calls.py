@@ -165,13 +165,12 @@ class CompiledStep:
             finite &= good
         return arrays["q1"], arrays["v1"], finite
 
-    def prepared(self, *given: Array) -> tuple[dict[str, Array], KernelSequence]:
-        """Return copies of q, v, tau, dt (N, 1) and what is behind, with results by name, and the calls on these."""
-        names = ("q", "v", "tau", "dt", *self._extra)
+    def room(self, n: int) -> tuple[dict[str, Array], KernelSequence]:
+        """Return room for n states by name: what steps read, zero, and what they write; and the calls on it."""
+        sizes = dict(zip(("q", "v", "tau", *self._extra), self._sizes, strict=True)) | {"dt": 1, "squares": 1}
+        for code, _, writes in self._steps:
+            sizes |= zip(writes, (rows for rows, _ in code.shapes), strict=True)
         # One number after the other, of all states.
-        arrays = {name: np.array(x.T, order="C").T for name, x in zip(names, given, strict=True)}
-        arrays["squares"], calls = np.zeros((len(given[0]), 1)), []
-        for code, reads, writes in self._steps:
-            arrays |= {x: np.empty((rows, len(given[0]))).T for x, (rows, _) in zip(writes, code.shapes, strict=True)}
-            calls.append(CallOf(code, [arrays[x] for x in reads], [arrays[x] for x in writes]))
-        return arrays, KernelSequence(calls)
+        arrays = {name: np.zeros((rows, n)).T for name, rows in sizes.items()}
+        calls = (CallOf(code, [arrays[x] for x in ins], [arrays[x] for x in outs]) for code, ins, outs in self._steps)
+        return arrays, KernelSequence([*calls])

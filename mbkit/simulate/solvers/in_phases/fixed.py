@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 
 from mbkit._check import EPS, Array
 from mbkit.engines import Dynamics
@@ -34,7 +35,7 @@ UNDECIDED: Final = "stopped, as which joints rest cannot be decided"
 #: Steps of a block, at least.
 _BLOCK: Final = 32
 #: Steps of states in the time of a block's set-up and of its changes, by machine code and in Python.
-_SET_UP: Final = {True: 2**13, False: 2**5}
+_SET_UP: Final = {True: 2**14, False: 2**5}
 #: States of a block, at most.
 _MOST_STATES: Final = 2**16
 #: Fraction of a step before which the end of a phase is not searched.
@@ -93,6 +94,9 @@ class _Members:
         self._empty = np.zeros(n, dtype=int)
         self._going = np.full(n, True)
         self._phase: Phase
+        self._step_room: tuple[dict[str, Array], Any] = {}, None
+        #: States that have room there.
+        self._most = 0
 
     def to_end(self) -> None:
         """Go over the grid."""
@@ -175,12 +179,18 @@ class _Members:
 
     def _keep(self, rows: Indices, k: Indices, count: Indices, q: Array, v: Array) -> None:
         """Put wanted states into the record: of (m, n + 1) behind k steps each row has so many, and one in front."""
-        record, dense = self._record, len(self._record.kept) > self.problem.grid.steps
-        # Slices of each row take a quarter of the time of lists of indices of all.
-        each = zip(self.members[rows].tolist(), k.tolist(), count.tolist(), strict=True)
-        for i, (member, first, n) in enumerate(each):
-            saved = slice(first + 1, first + n + 1) if dense else record.rows(first + 1, first + n)
-            which: Any = slice(1, n + 1) if dense else record.kept[saved] - first
+        record, members, steps = self._record, self.members[rows], self.problem.grid.steps
+        if len(record.kept) > steps:
+            # States behind the end of a phase are written again. Rows that have room for as many are written at once.
+            room = np.minimum(q.shape[1], steps + 1 - k)
+            for n in np.unique(room).tolist():
+                its = np.flatnonzero(room == n)
+                for to, x in ((record.q, q), (record.v, v)):
+                    _windows(to, n)[members[its] * (steps + 1) + k[its]] = x[its, :n].reshape(len(its), -1)
+            return
+        for i, (member, first, n) in enumerate(zip(members.tolist(), k.tolist(), count.tolist(), strict=True)):
+            saved = record.rows(first + 1, first + n)
+            which = record.kept[saved] - first
             record.q[member, saved], record.v[member, saved] = q[i, which], v[i, which]
 
     # A block
@@ -195,7 +205,11 @@ class _Members:
         if not left.any():
             return rows, left + 1, 1, grid.last
         rows, left = rows[left > 0], left[left > 0]
-        n = min(self._window(len(rows)), int(left.max()), max(_MOST_STATES // len(rows), _BLOCK))
+        # Steps behind the end of the run take no more time than another block for those who are hindmost.
+        ends = np.sort(left)
+        vain = ends * np.arange(1, len(ends) + 1) - ends.cumsum()
+        most = int(ends[np.searchsorted(vain, _SET_UP[self._compiled(self._phase.dyn)], side="right") - 1])
+        n = min(self._window(len(rows)), most, max(_MOST_STATES // len(rows), _BLOCK))
         if self._timed:
             # Up to where the next ones stand.
             ahead = left.max() - left[left < left.max()]
@@ -231,7 +245,9 @@ class _Members:
             times: Any = start + np.arange(1, q.shape[1]) * h
             margins = self._margins_of(phase, times, q[0, 1:], v[0, 1:])
         good = self._good(rows, phase, q, v, margins, limit, start, h)
-        self._ends = float((good < limit).sum() / max(good.sum(), 1)), 4 * n
+        rate = float((good < limit).sum() / max(good.sum(), 1))
+        # Many that move alike end their phases in every other block.
+        self._ends = max(rate, self._ends[0] / 2), 4 * n
         last = np.arange(len(rows)), good
         if phase.still.any() and not (compiled and self.side_by_side):
             # What rests keeps its place and no velocity, to the bit.
@@ -277,6 +293,14 @@ class _Members:
     def margin_part(self) -> Any:
         """The least margin, as a part behind a step."""
         return self.phases.margin_part(self._phase.dyn)
+
+    def step_room(self, n: int) -> tuple[dict[str, Array], Any]:
+        """Return room for a step of n states with their margins, and the calls on it."""
+        if n > self._most:
+            dyn: Any = self._phase.dyn
+            self._most = max(n, 2 * self._most)
+            self._step_room = dyn._step_with(self.problem.method, self.margin_part).room(self._most)
+        return self._step_room
 
     def _margins_of(self, phase: Phase, t: Array, q: Array, v: Array) -> Array:
         """Return the least margins of the states of a block of one trajectory, (1, n)."""
@@ -432,6 +456,12 @@ class _Members:
         return after, decided
 
 
+def _windows(states: Array, n: int) -> Array:
+    """Return n states in a row from each one of trajectories on, which share memory, (·, n of states)."""
+    flat = states.reshape(-1, states.shape[2])
+    return as_strided(flat, (len(flat) - n + 1, n * flat.shape[1]), (flat.strides[0], flat.itemsize))
+
+
 def _first(over: Any, limit: Indices) -> Indices:
     """Return before which place each row is over first, (m,), or its limit if that comes before."""
     # A place behind the last, as a block whose first step fails has none.
@@ -459,9 +489,11 @@ class _PartOfStep:
         dyn: Any = phase.dyn
         timed = dyn.model.time_parameter
         if run._compiled(dyn):
-            n, code = len(rows), dyn._step_with(run.problem.method, run.margin_part)
-            more = (np.broadcast_to(x, (n, x.shape[1])) for x in (run.phases.bounds(phase), with_time(dyn, t)))
-            self._arrays, self._calls = code.prepared(run.q[rows], run.v[rows], self._force, np.zeros((n, 1)), *more)
+            self._arrays, self._calls = run.step_room(len(rows))
+            states = {"q": run.q[rows], "v": run.v[rows], "tau": self._force}
+            states |= {"bound": run.phases.bounds(phase), "parameters": with_time(dyn, t)}
+            for name, x in states.items():
+                self._arrays[name][: len(rows)] = x
         self._stepped = self._method.explicit and timed is None and not callable(self._force)
 
     def ahead(self, i: Indices, s: Array) -> tuple[Array, Array, Array]:
@@ -490,7 +522,7 @@ class _PartOfStep:
         if not self._arrays:
             return None
         self._arrays["dt"][i, 0] = s
-        self._calls.run_once()
+        self._calls.run_once(len(self._rows))
         out = [self._arrays[name][i] for name in ("margins1", "q1", "v1")]
         return out[0] if all(np.isfinite(x).all() for x in out) else None
 

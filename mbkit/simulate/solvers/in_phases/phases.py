@@ -166,6 +166,7 @@ class Phases:
         self._names = dyn.model.velocity_names
         #: Velocities with friction.
         self.which = self._own.law.which
+        self._rubs = np.isin(np.arange(dyn.model.nv), self.which)
         layout = dyn.model.layout
         places = (
             range(layout.q[j.name].start, layout.q[j.name].start + j.type.nv) for j in dyn.model.independent_joints
@@ -343,8 +344,7 @@ class Phases:
     def changes(self, before: Phase, after: Phase) -> list[tuple[int, str]]:
         """Return which trajectory's velocity stops, lets go or turns from one phase to the next, in words."""
         rested, rests = np.atleast_2d(before.still, after.still)
-        turned = np.atleast_2d((before.sides * after.sides < 0) & np.isin(np.arange(rests.shape[1]), self.which))
-        turned &= ~(rested | rests)
+        turned = np.atleast_2d(before.sides * after.sides < 0) & self._rubs & ~(rested | rests)
         out = []
         for row, i in zip(*(x.tolist() for x in np.nonzero((rested != rests) | turned)), strict=True):
             what = "stops" if rests[row, i] else "lets go" if rested[row, i] else "turns"
