@@ -248,33 +248,22 @@ def test_functions_stand_beside_samples() -> None:
 BAD: list[tuple[Any, type[Exception], str]] = [
     ({"wrenches": {"bric": WRENCH}}, UnknownNameError, "brick"),
     ({"wrenches": [WRENCH]}, InputError, "wrenches: expected a dict"),
-    (
-        {"wrenches": {"brick": WRENCH[:5]}},
-        InputError,
-        r"wrench on 'brick': expected shape \(6,\) or \(10, 6\), got \(5,\)",
-    ),
+    ({"wrenches": {"brick": WRENCH[:5]}}, InputError, r"wrench on 'brick': expected shape .*, got \(5,\)"),
     ({"wrenches": {"brick": np.zeros((9, 6))}}, InputError, r"got \(9, 6\).* the run has 10 steps"),
     ({"wrenches": {"brick": [WRENCH, WRENCH[:3]]}}, InputError, "rows of different lengths"),
     ({"wrenches": {"brick": WRENCH * np.nan}}, InputError, "wrench on 'brick': nan at index"),
     ({"wrenches": {"brick": WRENCH}, "wrench_axes": "body-ish"}, InputError, "axes: expected one of"),
     ({"wrenches": {"brick": lambda t, *_: WRENCH * (np.nan if t > 0.045 else 1)}}, TorqueError, "at t = 0.05 s"),
     ({"wrenches": {"brick": lambda *_: WRENCH[:3]}}, TorqueError, r"wrench on 'brick': expected shape \(6,\)"),
-    (
-        {"wrenches": {"brick": lambda *_: 1 / 0}},
-        TorqueError,
-        "wrench on 'brick': the callable raised ZeroDivisionError",
-    ),
+    ({"wrenches": {"brick": lambda *_: 1 / 0}}, TorqueError, "wrench on 'brick': .* ZeroDivisionError"),
 ]
 
 
 @pytest.mark.parametrize(("change", "error", "text"), BAD)
-@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
-def test_bad_input_is_named(engine: str, change: Any, error: type[Exception], text: str) -> None:
+def test_bad_input_is_named(change: Any, error: type[Exception], text: str) -> None:
     model = brick()
     with pytest.raises(error, match=text):
-        mb.simulate(
-            mb.dynamics(model, engine), model.neutral(), np.zeros(6), 0.1, "semi_implicit_euler", 0.01, **change
-        )
+        mb.simulate(mb.dynamics(model), model.neutral(), np.zeros(6), 0.1, "semi_implicit_euler", 0.01, **change)
 
 
 def test_rows_for_trajectories_or_steps_must_be_told_apart() -> None:

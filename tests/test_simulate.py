@@ -27,7 +27,6 @@ from mbkit.errors import (
     InputError,
     MbkitWarning,
     OutputError,
-    UnknownNameError,
     UnsupportedError,
 )
 from mbkit.methods.tableaus import (
@@ -45,7 +44,7 @@ from mbkit.model.integration_space import Space
 from mbkit.simulate import METHODS, RK4, Tableau, Trajectory, simulate
 from mbkit.simulate.time_grid import Grid
 from tests import orders
-from tests.scenes import chain, damped_arm, hinge, slider
+from tests.scenes import chain, damped_arm, slider
 from validation import closed_forms
 
 EPS = np.finfo(float).eps
@@ -262,15 +261,9 @@ def kinds() -> Model:
     return chain(*(body | place | link for link in links)).build()
 
 
-@pytest.mark.thorough(every=3)
-@pytest.mark.parametrize("name", [*(n for n, f in catalog.systems().items() if not f().constrained), "kinds"])
-def test_rollouts_of_the_catalog_and_of_every_joint_are_mujocos(name: str) -> None:
-    model = kinds() if name == "kinds" else catalog.get(name)()
-    q, v = model.random_state(np.random.default_rng(name != "kinds"))
-    assert_as_mujoco(model, q, v, duration=0.2)
-
-
-def test_rollouts_of_every_rotation_and_with_dampers_and_springs_are_mujocos() -> None:
+def test_rollouts_of_every_joint_and_with_dampers_and_springs_are_mujocos() -> None:
+    model = kinds()
+    assert_as_mujoco(model, *model.random_state(np.random.default_rng(0)), duration=0.2)
     model, q, v = tumbling()
     # Long steps: at 1 ms the last term of dexp⁻¹ is below rounding.
     assert_as_mujoco(model, q, 3 * v, duration=0.3035, dt=0.01)
@@ -343,23 +336,6 @@ def test_dop853_tolerance_rules_the_error() -> None:
         cost.append(run.stats.evaluations)
     assert errors[0] > 10 * errors[1] > 100 * errors[2]
     assert cost[0] < cost[1] < cost[2]
-
-
-def test_dop853_holds_torques_over_the_intervals_of_save() -> None:
-    model = catalog.double_pendulum()
-    dyn = dynamics(model)
-    grid = np.linspace(0, 0.2, 5)
-    tau = np.random.default_rng(0).standard_normal((4, 2))
-    run = simulate(dyn, [0.5, 0.2], [0.0, 0.0], 0.2, "dop853", rtol=1e-12, torque=tau, save=grid)
-    fine = simulate(dyn, [0.5, 0.2], [0.0, 0.0], 0.2, "rk4", dt=5e-4, torque=np.repeat(tau, 100, axis=0), save=grid)
-    assert np.array_equal(run.t, grid)
-    assert run.q == pytest.approx(fine.q, abs=1e-10)
-    q = np.array([[0.5, 0.2], [0.1, 0.0]])
-    both = simulate(dyn, q, [0.0, 0.0], 0.2, "dop853", rtol=1e-12, torque=np.stack([tau, -tau]), save=grid)
-    assert both.q.shape == (2, 5, 2)
-    assert both.q[0] == pytest.approx(run.q, abs=1e-13)
-    with pytest.raises(InputError, match="one row per interval needs save="):
-        simulate(dyn, [0.5, 0.2], [0.0, 0.0], 0.2, "dop853", torque=tau)
 
 
 # Grids
@@ -479,39 +455,6 @@ def test_native_divergence_is_void_from_there(tmp_path: Path, monkeypatch: pytes
     assert alone.t[-1] == alone.stats.reached < 0.1
 
 
-# Bad input
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"dt": 1e-300}, r"dt: .* expected a larger step"),
-        ({"dt": 1e-12}, r"save: .* GiB; keep fewer"),
-        ({"q0": [0.0]}, r"q0: expected shape \(7,\) or \(N, 7\), got \(1,\); free_body has nq = 7"),
-        ({"v0": np.zeros(7)}, r"v0: expected shape \(6,\)"),
-        ({"q0": [0, 0, 0, 0, 0, 0, 2.0]}, r"q0: the quaternion of joint 'float'.*norm 2"),
-        ({"q0": np.tile([0, 0, 0, 0, 0, 0, 1.0], (2, 1)), "v0": np.zeros((3, 6))}, r"batches of different sizes"),
-        ({"torque": np.zeros(5)}, r"torque: expected shape \(6,\) or \(10, 6\), got \(5,\).*10 steps"),
-        ({"save": 0}, r"save: expected a count of at least 1"),
-        ({"save": True}, r"save: expected increasing times"),
-        ({"save": [0.0, 0.0005]}, r"save: 0.0005 s is not a step"),
-        ({"method": "dop853", "rtol": 1e-15}, r"rtol: expected at least 2.22e-14"),
-        ({"method": "dop853", "rtol": -1.0}, r"rtol: expected a number above 0"),
-        ({"method": "dop853", "atol": 0.0}, r"atol: expected a number above 0"),
-        ({"method": "dop853", "save": 5}, r"save: expected a grid of times for an adaptive method"),
-        ({"method": "dop853", "q0": np.tile([0, 0, 0, 0, 0, 0, 1.0], (2, 1))}, r"save: expected a grid of times"),
-        ({"method": 4}, r"method: expected a name"),
-        ({"dyn": catalog.pendulum()}, r"dyn: expected a Dynamics, got Model"),
-    ],
-)
-def test_bad_input_is_named(change: dict[str, Any], message: str) -> None:
-    usual = {"dyn": dynamics(catalog.free_body()), "q0": [0, 0, 0, 0, 0, 0, 1], "v0": np.zeros(6), "duration": 0.01}
-    with pytest.raises(InputError, match=message):
-        simulate(**(usual | change))
-    with pytest.raises(UnknownNameError, match="unknown method 'RK-4'; did you mean 'rk4'"):
-        simulate(**(usual | {"method": "RK-4"}))
-
-
 # Trajectories
 
 
@@ -566,12 +509,6 @@ def test_progress_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert simulate(dyn, [1.0], [0.0], 0.05, progress=True).stats.finished
 
 
-def test_what_belongs_to_simulate_is_there_at_once() -> None:
-    code = "import mbkit as mb; assert 'rk4' in mb.simulate.METHODS and callable(mb.simulate)"
-    env = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    subprocess.run([sys.executable, "-c", code], env=env, check=True)
-
-
 def test_a_start_beyond_a_joints_limits_is_warned_of(recwarn: pytest.WarningsRecorder) -> None:
     ur5 = mb.load("ur5")
     dyn, q = dynamics(ur5), ur5.neutral()
@@ -594,12 +531,3 @@ def test_warnings_point_at_the_line_that_called(call):
     assert {warning.filename for warning in heard} == {__file__}
 
 
-@pytest.mark.parametrize(("friction", "moves"), [(4.905, True), (9.82, False)])
-def test_dry_friction_holds_an_arm_or_slows_it(friction, moves):
-    """An arm of 2 kg at 0.5 m, held at the horizontal, has 9.81 Nm."""
-    model = hinge(mass=2.0, com=(0.5, 0, 0), friction=friction).build()
-    runs = [mb.simulate(mb.dynamics(m, "lagrangian"), [0.0], [0.0], 0.1) for m in (model, model.without("friction"))]
-    assert (runs[0].v[-1, 0] != 0) == moves
-    assert abs(runs[0].v[-1, 0]) < abs(runs[1].v[-1, 0])
-    assert "has gravity, dry friction" in repr(model)
-    assert "friction" not in repr(model.without("friction")).split("without")[0]

@@ -248,23 +248,6 @@ def test_adaptive_methods_take_a_table_over_the_saved_times(batch: bool) -> None
         np.testing.assert_array_equal(run.wrenches()["m"].reshape(-1, 4, 6)[0, :-1], w)
 
 
-def test_springs_dampers_and_friction_are_balanced_beside_them() -> None:
-    b = block(friction=0.3, damping=0.2)
-    b.add_spring("band", body_a="world", body_b="m", point_a=(0, 1, 0), stiffness=20.0, rest_length=0.5, damping=0.4)
-    w = np.zeros((200, 6))
-    w[:, 0] = np.cos(0.1 * np.arange(200))
-    run = simulate(
-        *(mb.dynamics(b.build(point_masses=True)), [[0.3], [0.0]], [[0.2], [1.0]], 2.0),
-        dt=0.01,
-        torque=sampled_law,
-        hold=0.05,
-        wrenches={"m": w},
-    )
-    assert run.events
-    assert np.abs(run.power_balance()).max() < 1e-5
-    assert np.abs(run.work()).max() > 0.1
-
-
 def test_what_is_no_table_of_wrenches_is_named() -> None:
     dyn = mb.dynamics(block().build(point_masses=True))
     with pytest.raises(mb.errors.InputError, match=r"between 0 and 1 s, got 1\.0000000001 to 1\.0000000001 s"):
