@@ -2,8 +2,8 @@
 
 Nothing here imports mbkit, and only NumPy computes. First the terms of catalog systems, each a `System` as in
 ``closed_forms`` (where pendulum, double pendulum, cart-pole, spherical pendulum, chain, heavy top and free body
-are), those with springs a `Sprung`; then the systems of one coordinate, reduced or driven, that no
-description of bodies and joints has. Motions along time are in ``elliptic`` and ``motions``.
+are), those with springs a `Sprung`; then the systems of one coordinate, driven or in a plane of
+their own, that no description of bodies and joints has. Motions along time are in ``elliptic`` and ``motions``.
 
 Each function names its source. "Derived here" means: from positions and velocities, as its docstring or comment
 says. As in ``closed_forms`` energies are written apart from the matrices, so that T = ½ vᵀ M v is a check
@@ -810,83 +810,3 @@ class Kapitza:
     def upright_square(self) -> float:
         """ω² of slow oscillations about the upright, a² Ω²/(2 l²) - g/l."""
         return (self.amplitude * self.frequency / self.length) ** 2 / 2 - self.g / self.length
-
-
-# --------------------------------------------------------------------------------------
-# Routh's reduction to one coordinate
-
-
-@dataclass(frozen=True)
-class ReducedPendulum:
-    """The spherical pendulum at a constant momentum p = m l² sin² θ φ̇ (Landau, Lifshitz 1976, §14)."""
-
-    momentum: float
-    length: float = 1.0
-    mass: float = 1.0
-    g: float = 9.81
-
-    def effective_potential(self, theta: Any) -> Any:
-        J = self.mass * self.length**2
-        return self.momentum**2 / (2 * J * np.sin(theta) ** 2) - self.mass * self.g * self.length * np.cos(theta)
-
-    def acceleration(self, theta: Any) -> Any:
-        """Return θ̈, minus the potential's slope by m l²."""
-        J = self.mass * self.length**2
-        return (self.momentum / J) ** 2 * np.cos(theta) / np.sin(theta) ** 3 - self.g / self.length * np.sin(theta)
-
-    def azimuth_rate(self, theta: Any) -> Any:
-        return self.momentum / (self.mass * self.length**2 * np.sin(theta) ** 2)
-
-    def limits(self, energy: float) -> tuple[float, float]:
-        """Return the least and greatest θ: with u = cos θ, (1 - u²)(E + m g l u) = p²/(2 m l²)."""
-        weight, square = self.mass * self.g * self.length, self.momentum**2 / (2 * self.mass * self.length**2)
-        return _within([-weight, -energy, weight, energy - square])
-
-
-@dataclass(frozen=True)
-class ReducedTop:
-    """Lagrange's top at constant momenta p_φ and p_ψ = C ω₃; θ from the *upward* vertical.
-
-    Landau, Lifshitz 1976, §35 problem 1; Goldstein, Poole, Safko 2002, ch. 5.7. A is the moment across the axis
-    about the fixed point and `weight` is m g r. The energies leave out the constant p_ψ²/(2 C).
-    """
-
-    across: float
-    along: float
-    weight: float
-    p_phi: float
-    p_psi: float
-
-    def effective_potential(self, theta: Any) -> Any:
-        left = self.p_phi - self.p_psi * np.cos(theta)
-        return left**2 / (2 * self.across * np.sin(theta) ** 2) + self.weight * np.cos(theta)
-
-    def acceleration(self, theta: Any) -> Any:
-        """Return θ̈."""
-        s, c = np.sin(theta), np.cos(theta)
-        left = self.p_phi - self.p_psi * c
-        return (self.weight * s - left * (self.p_psi * s**2 - left * c) / (self.across * s**3)) / self.across
-
-    def ignored_rates(self, theta: Any) -> tuple[Any, Any]:
-        """Return φ̇ and ψ̇."""
-        c = np.cos(theta)
-        phi = (self.p_phi - self.p_psi * c) / (self.across * np.sin(theta) ** 2)
-        return phi, self.p_psi / self.along - phi * c
-
-    def limits(self, energy: float) -> tuple[float, float]:
-        """Return the least and greatest θ: with u = cos θ, 2 A (1 - u²)(E - m g r u) = (p_φ - p_ψ u)²."""
-        A, w, a, b = self.across, self.weight, self.p_psi, self.p_phi
-        return _within([2 * A * w, -2 * A * energy - a * a, 2 * a * b - 2 * A * w, 2 * A * energy - b * b])
-
-    def sleeps(self) -> bool:
-        """Say whether the upright top is stable: p_ψ² > 4 A m g r."""
-        return self.p_psi**2 > 4 * self.across * self.weight
-
-
-def _within(cubic: list[float]) -> tuple[float, float]:
-    """Return acos of the two roots in [-1, 1], of three real ones of which the third lies outside, ascending."""
-    roots = np.roots(cubic)
-    # Where they meet, the two are a root of the derivative, and rounding splits them into a complex pair.
-    inside = sorted(roots.real, key=lambda u: abs(u))[:2]
-    low, high = (float(np.arccos(np.clip(u, -1, 1))) for u in (max(inside), min(inside)))
-    return low, high
