@@ -133,18 +133,6 @@ def test_the_parts_of_the_kinetic_energy(make):
         assert sp.simplify(part.subs(scaled, simultaneous=True) - s**degree * part) == 0
 
 
-@pytest.mark.parametrize("make", [pendulum, hoop, cart])
-def test_christoffels_matrix_leaves_a_skew_difference(make):
-    lag = make()
-    eom = lag.equations()
-    rate = sum(
-        (sp.diff(eom.mass_matrix, q) * v for q, v in zip(lag.coordinates, lag.velocities, strict=True)),
-        0 * eom.mass_matrix,
-    )
-    S = rate - 2 * eom.coriolis_matrix
-    assert sp.simplify(S + S.T) == sp.zeros(len(lag.coordinates))
-
-
 def test_the_blackboards_own_form():
     one, two = dynamicsymbols("theta1 theta2")
     now = dynamicsymbols._t
@@ -303,26 +291,6 @@ def test_a_force_that_is_one_symbol_is_the_torque():
     assert np.allclose(dyn.passive(q, v) + np.array([3.0, 0.0]), np.array(force, dtype=float)[:, 0], atol=1e-14)
 
 
-def test_power_balances_with_everything_that_acts():
-    dyn = cart().dynamics()
-    run = mb.simulate(
-        dyn, [0.1, 1.0], [0.0, 0.5], 2.0, "rk853", rtol=1e-12, torque=[1.5, 0.0], save=np.linspace(0, 2, 401)
-    )
-    assert np.abs(run.power_balance()).max() < 1e-6
-    assert np.ptp(run.energy()) > 0.1
-
-
-def test_the_integral_of_jacobi_and_momenta_of_a_system_with_t0():
-    lag = hoop()
-    run = mb.simulate(lag.dynamics(), [0.4], [1.0], 3.0, "rk853", rtol=1e-12)
-    q, v = run.q[:, 0], run.v[:, 0]
-    M, R, G = (lag.parameters[s] for s in (m, l, g))
-    h = M * R**2 * (v**2 - 81.0 * np.sin(q) ** 2) / 2 - M * G * R * np.cos(q)
-    assert np.ptp(h) < 1e-10
-    assert np.ptp(run.energy()) > 1e-2  # the hoop's drive does work
-    assert np.allclose(run.canonical_momentum()[:, 0], M * R**2 * v, rtol=1e-14, atol=1e-15)
-
-
 def test_momenta_of_a_moving_frame():
     lag = driven()
     run = mb.simulate(lag.dynamics(), [1.0], [0.3], 0.2, "rk853", save=[0.0, 0.05, 0.2])
@@ -330,16 +298,6 @@ def test_momenta_of_a_moving_frame():
     assert np.allclose(run.canonical_momentum()[:, 0], p(run.q[:, 0], run.v[:, 0], run.t), rtol=1e-13)
     T = sp.lambdify([th, w, t], lag.T.subs(lag.parameters))
     assert np.allclose(run.kinetic_energy(), T(run.q[:, 0], run.v[:, 0], run.t), rtol=1e-13)
-
-
-def test_a_batch_in_time_is_its_members():
-    dyn, q, v = driven().dynamics(), np.array([[1.0], [0.4], [-2.0]]), np.array([[0.0], [1.0], [2.0]])
-    save = np.linspace(0, 0.4, 5)
-    whole = mb.simulate(dyn, q, v, 0.4, "rk853", save=save)
-    for i in range(3):
-        one = mb.simulate(dyn, q[i], v[i], 0.4, "rk853", save=save)
-        assert np.abs(whole.q[i] - one.q).max() < 1e-9
-        assert np.allclose(whole.energy()[i], one.energy(), rtol=1e-8)
 
 
 def test_parameters_move_without_deriving_again():
@@ -404,10 +362,7 @@ WRONG = [
     # Singular everywhere, by an identity and for more coordinates than have a short determinant.
     (lambda: Lagrangian((w * sp.cos(th) + u * sp.sin(th)) ** 2, 0, [th, x], [w, u]), "thetadot, xdot together"),
     (lambda: Lagrangian(sum((a + b) ** 2 for a, b in pairwise(MANY)), 0, sp.symbols("a:6"), MANY), "b5 together"),
-    (
-        lambda: Lagrangian(w**2, x, [th, x], [w, u], constraints=[th - 1]),
-        "no kinetic energy has xdot and no constraint",
-    ),
+    (lambda: Lagrangian(w**2, x, [th, x], [w, u], constraints=[th - 1]), "no kinetic energy has xdot and no con"),
     # Names stand for one thing each.
     (lambda: Lagrangian(w**2 * m, 0, [th], parameters={m: 1.0, sp.Symbol("m"): 2.0}), "'m' stands twice"),
     (lambda: Lagrangian(w**2, 0, [th], parameters=[sp.Symbol("thetaddot")]), "the derivative of thetadot is called"),
@@ -451,14 +406,8 @@ def test_a_name_is_one_symbol_whatever_is_assumed_of_it():
 
 def test_constraints_are_equations_or_one_expression():
     assert Lagrangian(w**2 + u**2, 0, [th, x], [w, u], constraints=sp.Eq(th, 2 * x)).constraints == (th - 2 * x,)
-    taken = Lagrangian(
-        sp.Symbol("lambda1") * (w**2 + u**2),
-        0,
-        [th, x],
-        [w, u],
-        parameters=sp.symbols("lambda1,"),
-        constraints=th - x,
-    )
+    one = sp.Symbol("lambda1")
+    taken = Lagrangian(one * (w**2 + u**2), 0, [th, x], [w, u], parameters=[one], constraints=th - x)
     assert str(taken.equations()).splitlines()[0] == "2*lambda1*thetaddot = Lambda1"
 
 
@@ -507,20 +456,8 @@ def test_angles_that_depend_on_each_other_lose_no_term(seed):
     assert tidy(5 * x * sp.cos(th + 1) + x * sp.cos(th + half) * sp.cos(half)).coeff(x).subs(th, 0).evalf() == (
         pytest.approx(5 * np.cos(1) + np.cos(0.5) ** 2)
     )
-    angles = [
-        th,
-        th / 2,
-        2 * th,
-        c / 3,
-        c,
-        th + 1,
-        th - half,
-        1 - th,
-        c + sp.pi / 3,
-        c - sp.pi / 6,
-        half,
-        sp.Integer(1),
-    ]
+    angles = [th, th / 2, 2 * th, c / 3, c, th + 1, th - half, 1 - th]
+    angles += [c + sp.pi / 3, c - sp.pi / 6, half, sp.Integer(1)]
     at = {th: sp.Float(0.3, 40), c: sp.Float(0.7, 40)}
     for _ in range(10):
         factors = [pick.choice([sp.sin, sp.cos])(pick.choice(angles)) ** pick.randint(1, 2) for _ in range(9)]
@@ -551,12 +488,10 @@ def test_zero_is_told_by_value():
     assert hidden.cyclic_coordinates() == (th,)
 
 
-@pytest.mark.parametrize("study", [mb.dynamics, mb.compare, mb.work_precision, mb.convert], ids=lambda f: f.__name__)
-def test_what_takes_a_description_or_an_engine_says_where_paper_has_it(study) -> None:
+def test_what_takes_a_description_or_an_engine_says_where_paper_has_it() -> None:
     lag = pendulum()
-    more = {"to": "mjcf"} if study is mb.convert else {}
     with pytest.raises(InputError, match=r"model: expected a Model, got Lagrangian; its \.model is one"):
-        study(lag, **more)
+        mb.dynamics(lag)
     with pytest.raises(InputError, match=r"dyn: expected a Dynamics, got Lagrangian; its \.dynamics\(\) makes one"):
         mb.simulate(lag, [0.1], [0.0], 1.0)
 
