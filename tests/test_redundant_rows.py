@@ -62,18 +62,11 @@ class Mechanism:
         for k, kind in enumerate(self.kinds):
             b.add_body(f"b{k}", mass=self.masses[k], com=self.coms[k], inertia=self.moments[k])
             axis = [float(x) for x in self.axes[k]]
-            b.add_joint(
-                f"j{k}",
-                kind,
-                parent=f"b{k - 1}" if k else "world",
-                child=f"b{k}",
-                translation=self.places[k],
-                axis=axis,
-            )
+            place = {"parent": f"b{k - 1}" if k else "world", "translation": self.places[k], "axis": axis}
+            b.add_joint(f"j{k}", kind, child=f"b{k}", **place)
         for i, (a, p) in enumerate(self.points):
-            b.add_loop(
-                f"l{i}", "point", body_a="world", body_b=f"b{len(self.kinds) - 1}", translation_a=a, translation_b=p
-            )
+            ends = {"body_a": "world", "translation_a": a, "translation_b": p}
+            b.add_loop(f"l{i}", "point", body_b=f"b{len(self.kinds) - 1}", **ends)
         return b.build()
 
     def poses(self) -> list[tuple[mp.matrix, mp.matrix]]:
@@ -183,10 +176,7 @@ def without(basis: list[tuple[int, mp.matrix]], y: mp.matrix) -> mp.matrix:
 def test_accelerations_keep_what_the_condition_of_the_rows_leaves(seed: int) -> None:
     mechanism = Mechanism(seed)
     model = mechanism.model()
-    engines = {
-        "lagrangian": mb.dynamics(model, "lagrangian", compile=False),
-        "pinocchio": mb.dynamics(model, "pinocchio"),
-    }
+    engines = {name: mb.dynamics(model, name) for name in ("lagrangian", "pinocchio")}
     for moving in (False, True):
         with mp.workdps(40):
             v, exact, condition, free = mechanism.exact(moving)
@@ -333,23 +323,6 @@ def test_runs_of_equal_cranks_are_those_of_one_freedom(method: str) -> None:
     assert np.abs(energy - energy[0]).max() < (1e-10 if method in ("rk853", "taylor") else 1e-3)
 
 
-@pytest.mark.parametrize(
-    ("engine", "options"), [("lagrangian", {"compile": False}), ("lagrangian", {}), ("pinocchio", {})]
-)
-def test_a_pose_on_another_branch_is_refused_by_its_row(engine: str, options: dict[str, bool]) -> None:
-    model = cranks(0.0)
-    dyn = mb.dynamics(model, engine, **options)
-    moving = np.array([THETA, THETA, THETA, -THETA])
-    assert dyn.forward_dynamics(moving, np.zeros(4), np.zeros(4)).any()
-    assert len(choose_rows(model).independent) == 3
-    # The third crank crosses the others: four rows of rank four, and nothing moves.
-    other = np.array([4.7123890, -1.5707963, -1.5707963, 1.5707963])
-    with pytest.raises(NumericalError, match=r"loop 'loop2' z.*contradicts"):
-        dyn.forward_dynamics(np.array([moving, other]), np.zeros((2, 4)), [1.0, 0, 0, 0])
-    with pytest.raises(NumericalError, match=r"loop 'loop2' z.*contradicts"):
-        dyn.forward_dynamics(other, np.zeros(4), np.eye(4)[0])
-
-
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "oracle"])
 def test_dry_friction_at_rest_knows_the_branch_of_redundant_rows(engine: str) -> None:
     """Where the mechanism moves, friction holds or slides; where it cannot, the rows say so, and not an inertia."""
@@ -374,8 +347,11 @@ def test_dry_friction_at_rest_knows_the_branch_of_redundant_rows(engine: str) ->
 def test_forces_and_inertias_on_another_branch_are_refused_as_accelerations_are(engine: str) -> None:
     dyn, still = mb.dynamics(cranks(0.0), engine), np.zeros(4)
     moving = np.array([THETA, THETA, THETA, -THETA])
+    # The third crank crosses the others: four rows of rank four, and nothing moves.
     other = np.array([4.7123890, -1.5707963, -1.5707963, 1.5707963])
+    assert len(choose_rows(dyn.model).independent) == 3
     asked = {
+        "forward_dynamics": (still, [1.0, 0, 0, 0]),
         "constraint_forces": (still, [1.0, 0, 0, 0]),
         "generalized_constraint_force": (still, [1.0, 0, 0, 0]),
         "forward_dynamics_derivatives": (still, [1.0, 0, 0, 0]),
@@ -391,7 +367,7 @@ def test_forces_and_inertias_on_another_branch_are_refused_as_accelerations_are(
                 getattr(dyn, name)(other, *given)
 
 
-@pytest.mark.parametrize("options", [{}, {"compile": False}, {"engine": "oracle"}, {"engine": "pinocchio"}])
+@pytest.mark.parametrize("options", [{"compile": True}, {"engine": "oracle"}, {"engine": "pinocchio"}])
 def test_a_singular_pose_is_told_by_its_rows(options: dict[str, Any]) -> None:
     """Bars in line: the row along them has the slope that rounding of π leaves; no link without mass is to blame."""
     b = mb.ModelBuilder("in_line")
@@ -479,9 +455,8 @@ def rod_between_cranks(length: float) -> mb.Model:
 def test_a_rod_that_is_too_long_for_its_cranks_is_refused_with_what_is_left(engine: str, options: dict) -> None:
     q, v = np.array([0.3, 0.6]), np.zeros(2)
     # The cranks' ends are 0.3 + 0.5 + 0.3 m apart at most: (1.1² - 5²)/(2 5) is left of the row.
-    few = ("forward_dynamics", "constraint_forces", "step")
-    asked = set(ASKED) - {"mobility of q"} if engine == "lagrangian" else few
-    for ask in asked:
+    more = ("project", "random_state", "mobility") if engine == "lagrangian" else ()
+    for ask in ("forward_dynamics", "step", *more):
         # Each time anew: what was looked at once would be let through.
         dyn = mb.dynamics(rod_between_cranks(5.0), engine, **options)
         with pytest.raises(InputError, match=r"no configuration.*loop 'rod' length cannot hold.* is \[-2.38\]"):
@@ -504,20 +479,6 @@ def test_a_pose_off_the_branch_is_refused_with_its_residual_and_a_closed_pose(en
         assert closed == pytest.approx(q, abs=0.02)
     with pytest.warns(mb.errors.MbkitWarning, match=rf"loop 'loop2' x is open by {left:.2g}"):
         dyn.constraint_forces(q, v, v)
-
-
-@pytest.mark.parametrize(("engine", "options"), QUICK)
-def test_forces_at_a_singular_pose_name_its_rows(engine: str, options: dict) -> None:
-    # All rods of a parallelogram in line; links without mass are not to blame.
-    b = mb.ModelBuilder("flat")
-    for name, parent, at, length in (("crank", "world", 0, 1), ("coupler", "crank", 1, 2), ("rocker", "world", 2, 1)):
-        b.add_body(name, mass=1.0, com=(length / 2, 0, 0), inertia=(0.1, 0.1, 0.1))
-        b.add_joint(name, "revolute", parent=parent, child=name, axis=(0, 1, 0), translation=(at, 0, 0))
-    b.add_loop("pin", "point", body_a="coupler", translation_a=(2, 0, 0), body_b="rocker", translation_b=(1, 0, 0))
-    dyn = mb.dynamics(b.build(), engine, **options)
-    for ask in (dyn.constraint_forces, dyn.generalized_constraint_force, dyn.forward_dynamics):
-        with pytest.raises(NumericalError, match=r"singular pose, where .*loop 'pin'"):
-            ask(np.zeros(3), np.zeros(3), np.ones(3))
 
 
 def driven(first: float, second: float, amplitudes: tuple[float, float] | None = None) -> mb.Model:
@@ -564,7 +525,7 @@ def test_a_run_along_which_drives_part_ends_by_name(compiled: bool) -> None:
     assert np.isfinite(run.q).all()
 
 
-@pytest.mark.parametrize(("engine", "options"), [*QUICK, ("lagrangian", {})])
+@pytest.mark.parametrize(("engine", "options"), QUICK)
 def test_a_step_within_which_drives_part_is_refused_by_name(engine: str, options: dict) -> None:
     dyn = mb.dynamics(driven(2.0, 1.0, (0.5, 1.0)), engine, **options)
     with pytest.raises(NumericalError, match=r"'hinge1'.*contradicts.*'hinge0'"):

@@ -214,29 +214,6 @@ def test_one_of_a_batch_does_not_stop_the_others(method, setting, close, engine)
         assert run.q[k, -1, 0] == pytest.approx(motion(2, [0.5], *start)[0], abs=close)
 
 
-@pytest.mark.thorough(every=4)
-@pytest.mark.parametrize("aside", [1e-2, 1e-4, 1e-5, 1e-6, 1e-7, 1e-9, 0.0])
-@pytest.mark.parametrize(
-    ("method", "setting"),
-    [("rk4", {"dt": 1e-3}), ("rk853", {"rtol": 1e-10}), ("rodas5", {"rtol": 1e-10}), ("radau", {"rtol": 1e-10})],
-)
-def test_any_distance_from_the_pose_is_good_enough(aside, method, setting) -> None:
-    dyn = row(3)
-    q, v = parallel(dyn, FLAT + aside, -3.0)
-    run, _ = simulated(dyn, q, v, 0.3, method, save=[0.0, 0.3] if "rtol" in setting else None, **setting)
-    assert run.q[-1, 0] == pytest.approx(motion(3, [0.3], FLAT + aside, -3.0)[0], abs=1e-8)
-
-
-def test_two_runs_of_a_compiled_batch_are_those_alone() -> None:
-    dyn = mb.dynamics(row(2).model, "lagrangian", compile=True)
-    starts = [(math.pi - 0.3, 0.0), (-0.5, -4.0), (math.pi - 0.2, 0.1)]
-    q, v = (np.array(x) for x in zip(*(parallel(dyn, *start) for start in starts), strict=True))
-    together, _ = simulated(dyn, q, v, 0.5, "rk4", dt=1e-3)
-    for k in range(3):
-        alone, _ = simulated(dyn, q[k], v[k], 0.5, "rk4", dt=1e-3)
-        assert np.abs(together.q[k] - alone.q).max() < 1e-12
-
-
 @pytest.mark.thorough("rodas5")
 @pytest.mark.parametrize("method", ["rk853", "rodas5"])
 def test_only_steps_near_the_pose_leave_machine_code(method, monkeypatch) -> None:
@@ -330,16 +307,8 @@ def test_forces_of_a_massless_rod_go_along_it(crank_mass, rod_mass, theta) -> No
 def test_runs_with_massless_links_have_the_work_of_their_torque(method, setting, close) -> None:
     skip_without(method, "lagrangian")
     dyn = mb.dynamics(catalog.slider_crank(crank_mass=0.2, rod_mass=0.0), "lagrangian")
-    run, _ = simulated(
-        dyn,
-        np.zeros(3),
-        np.zeros(3),
-        0.2,
-        method,
-        torque=np.array([0.1, 0.0, 0.0]),
-        save=[0.0, 0.2] if "rtol" in setting else None,
-        **setting,
-    )
+    given = {"torque": np.array([0.1, 0.0, 0.0]), "save": [0.0, 0.2] if "rtol" in setting else None}
+    run, _ = simulated(dyn, np.zeros(3), np.zeros(3), 0.2, method, **given, **setting)
     theta, rate = run.q[-1, 0], run.v[-1, 0]
     by = -0.1 * math.sin(theta) * (1 + 0.1 * math.cos(theta) / math.sqrt(0.09 - (0.1 * math.sin(theta)) ** 2))
     energy = (0.2 * 0.01 / 3 + 0.4 * by**2) * rate**2 / 2
