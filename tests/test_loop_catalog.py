@@ -184,20 +184,6 @@ def test_mobility_at_the_neutral_pose_and_near_it(name: str) -> None:
         assert m.rank(q) == rows
 
 
-@pytest.mark.parametrize("name", MOBILITY)
-def test_links_are_as_near_to_the_ground_as_the_loops_allow(name: str) -> None:
-    """The longest chain of joints from the ground, with those without mass that carry a platform."""
-    model = catalog.get(name)()
-    parents = {j.child: j.parent for j in model.joints}
-
-    def depth(body: str) -> int:
-        return 0 if body == "world" else 1 + depth(parents[body])
-
-    deepest = {"scissor": 4, "stewart_platform": 4, "delta_robot": 4, "bricard": 3, "flyball_governor": 3}
-    deepest |= {"double_cardan_shaft": 3}
-    assert max(depth(b.name) for b in model.bodies) == deepest.get(name, 2)
-
-
 def _lengths(name: str) -> dict[str, float]:
     """Return the arguments that may be parameters."""
     return {k: x for k, x in OTHER[name].items() if isinstance(x, float) and (name, k) not in FIXED}
@@ -302,19 +288,6 @@ def test_a_thick_rod_is_a_solid_cylinder() -> None:
 # Planar mechanisms
 
 
-@pytest.mark.thorough("-1.0-values1", "2.6-values0", "2.6-values1")
-@pytest.mark.parametrize("values", [{}, OTHER["four_bar"]])
-@pytest.mark.parametrize("theta", [0.7, -1.0, 2.6])
-def test_four_bar_obeys_freudensteins_equation(values: dict[str, float], theta: float) -> None:
-    m = mechanism("four_bar", **values)
-    a, c, r, d = ({"crank": 0.3, "coupler": 0.9, "rocker": 0.7, "ground": 1.0} | values).values()
-    q = m.driven(theta=theta)
-    pin = next(b for b in m.model.bodies if b.name == "rocker").com * 2
-    Psi = q[2] + math.atan2(pin[2], pin[0])
-    K1, K2, K3 = d / a, d / r, (a**2 - c**2 + r**2 + d**2) / (2 * a * r)
-    assert K1 * math.cos(Psi) - K2 * math.cos(theta) + K3 == pytest.approx(math.cos(theta - Psi), abs=1e-13)
-
-
 def test_four_bar_has_the_accelerations_of_its_closed_form() -> None:
     m, dyn = mechanism("four_bar"), from_model(catalog.four_bar()).dynamics(options=OWN)
     (phi0, psi0), *_ = bare.geometry(np.longdouble(0))
@@ -328,18 +301,6 @@ def test_four_bar_has_the_accelerations_of_its_closed_form() -> None:
         assert dyn.forward_dynamics(q, v, np.zeros(3))[0] == pytest.approx(float(a), rel=1e-12)
 
 
-@pytest.mark.thorough("2", "3")
-@pytest.mark.parametrize("n", [1, 2, 3])
-def test_four_bars_move_as_one_pendulum(n: int) -> None:
-    model = catalog.four_bars(n=n)
-    names = model.coordinate_names
-    q, v = np.array([[0.4 * (-1) ** name.startswith("phi"), (-1.0) ** name.startswith("phi")] for name in names]).T
-    assert np.abs(Mechanism(model).gaps(q)).max() < 1e-15
-    a = from_model(model).dynamics(options=OWN).forward_dynamics(q, v, np.zeros(model.nv))
-    expected = ((n + 1) / 2 + n) * 9.81 / ((n + 1 + 3 * n) / 3) * math.sin(0.4)
-    assert a[0] == pytest.approx(expected, rel=1e-12)
-
-
 def test_four_bars_of_iftomm_a02_reach_the_exact_state() -> None:
     """The start of A02: upright, the first upper end at 1 m/s along +x; x, z and their rates after a second."""
     dyn = from_model(catalog.four_bars()).dynamics(options=OWN)
@@ -350,15 +311,6 @@ def test_four_bars_of_iftomm_a02_reach_the_exact_state() -> None:
     (theta, *_), (rate, *_) = run.q[0], run.v[0]
     got = [-math.sin(theta), math.cos(theta), -math.cos(theta) * rate, -math.sin(theta) * rate]
     assert got == pytest.approx(published()["iftomm_A02_double_four_bar"]["exact_x_y_vx_vy_of_B0"]["1"], abs=1e-8)
-
-
-@pytest.mark.thorough("2.5-values0", "2.5-values1", "-1.7-values1")
-@pytest.mark.parametrize("values", [{}, OTHER["slider_crank"]])
-@pytest.mark.parametrize("theta", [0.6, 2.5, -1.7])
-def test_slider_crank_has_the_pistons_way_of_the_textbook(values: dict[str, float], theta: float) -> None:
-    r, L = ({"crank": 0.1, "rod": 0.3} | values).values()
-    x = mechanism("slider_crank", **values).driven(theta=theta)[2]
-    assert x == pytest.approx(r * math.cos(theta) + math.sqrt(L**2 - (r * math.sin(theta)) ** 2) - r - L, abs=1e-13)
 
 
 @pytest.mark.parametrize("values", [{}, OTHER["five_bar"]])

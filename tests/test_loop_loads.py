@@ -10,7 +10,7 @@ import mbkit as mb
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from tests.scenes import chain
 from tests.test_loop_dynamics import closed_tree, four_bar
-from validation.four_bar import COUPLER, CRANK, GRAVITY, GROUND, LINE, ROCKER, geometry
+from validation.four_bar import COUPLER, CRANK, GRAVITY, LINE, ROCKER, geometry
 
 OWN = {"compile": False}
 #: Engines with rigid loops.
@@ -398,23 +398,3 @@ def test_forces_by_functions_enter_the_forces_of_actuators_and_have_no_load_on_s
         with pytest.raises(UnsupportedError, match="forces by functions are known by what they do"):
             dyn.joint_wrenches(q, v, None, tau=tau)
         assert not dyn.supports & {"joint_wrenches", "loop_wrenches", "newton_euler_residual"}
-
-
-def test_reduced_inertia_of_a_four_bar_is_that_of_its_geometry() -> None:
-    theta = 0.7
-    (phi, psi), (f1, r1), (f2, r2) = geometry(np.longdouble(theta))
-    a, c, r = CRANK, COUPLER, ROCKER
-    first = np.array([-a * np.sin(theta) - c / 2 * np.sin(phi) * f1, a * np.cos(theta) + c / 2 * np.cos(phi) * f1])
-    second = -a * np.array([np.cos(theta), np.sin(theta)])
-    second = second - c / 2 * (
-        np.array([np.cos(phi), np.sin(phi)]) * f1**2 - np.array([-np.sin(phi), np.cos(phi)]) * f2
-    )
-    J = LINE * (a**3 / 3 + c * (first @ first) + c**3 / 12 * f1**2 + r**3 / 3 * r1**2)
-    slope = 2 * LINE * (c * (first @ second) + c**3 / 12 * f1 * f2 + r**3 / 3 * r1 * r2)
-    model = four_bar()
-    q = [theta, float(phi) - theta, float(psi)]
-    for engine in ("oracle", *RIGID, "mujoco"):
-        got = dynamics(model, engine).reduced_inertia(q, "at_crank")
-        assert got.inertia == pytest.approx(float(J), rel=1e-12)
-        assert got.derivative == pytest.approx(float(slope), rel=1e-11)
-    assert GROUND == 1.0

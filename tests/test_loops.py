@@ -92,17 +92,6 @@ def test_a_slider_crank_reaches_the_published_digits(crank):
     assert np.abs(crank.constraint(run.q)).max() < 1e-14
 
 
-def test_a_slider_crank_of_massless_rods_is_the_classic_text_s():
-    lag = from_model(mb.catalog.slider_crank(crank_mass=0.0, rod_mass=0.0, piston_mass=1.3))
-    one = systems.slider_crank(mass=1.3).dynamics(options=OWN)
-    for th, rate in ((0.7, 2.0), (4.0, -5.0)):
-        tilt = math.asin(math.sin(th) / 3)
-        slope = math.cos(th) / (3 * math.cos(tilt))
-        v = rate * np.array([1.0, -1.0 - slope, -0.1 * math.sin(th) - 0.3 * math.sin(tilt) * slope])
-        got = lag.dynamics(options=OWN).forward_dynamics(at_angle(th), v, [0.1, 0, 0])
-        assert got[0] == pytest.approx(one.forward_dynamics([th], [rate], [0.1])[0], rel=1e-12)
-
-
 def test_symbols_stand_for_the_numbers_of_the_loop_too():
     model = mb.catalog.slider_crank(rod=0.5)
     assert {s.name: x for s, x in from_model(model).parameters.items()}["L2"] == 0.5
@@ -112,18 +101,6 @@ def test_symbols_stand_for_the_numbers_of_the_loop_too():
 
 
 # Andrews' squeezing mechanism: seven bodies, three loops
-
-
-def test_andrews_squeezing_mechanism_is_the_published_one():
-    """At its start; tests/test_published_mechanisms.py follows it to the printed end."""
-    told = published()["andrews_squeezing_mechanism"]
-    lag, zero = from_model(mb.catalog.andrews_squeezer()), np.zeros(7)
-    tau = np.array([told["drive_torque_on_beta"], *np.zeros(6)])
-    assert np.abs(lag.constraint(zero)).max() < 1e-16
-    a, lam = (np.array([float(x) for x in told[n]]) for n in ("qdd0", "lambda0"))
-    assert off(lag.dynamics(options=OWN).forward_dynamics(zero, zero, tau), a) < CLOSE
-    # The test set's multipliers stand on the other side of the equation.
-    assert off(lag.multipliers(zero, zero, tau), -lam) < CLOSE
 
 
 # Four bars: point and frame, in any plane
@@ -223,27 +200,6 @@ def test_a_loop_in_space_has_the_tree_s_terms(linkage):
     # What the tree's own equation leaves is Jᵀ λ.
     a, lam = dyn.forward_dynamics(q, v, tau), lag.multipliers(q, v, tau)
     assert off(pin.inverse_dynamics(q, v, a) - tau, J.T @ lam) < CLOSE
-
-
-@pytest.mark.thorough
-def test_a_frame_closed_in_space_moves_as_the_point_does(linkage):
-    lag, model, q, v = linkage
-    weld, open_weld = from_model(ball_linkage("frame")), mb.dynamics(ball_linkage("frame").without("loops"))
-    tree = mb.dynamics(model)
-    turned = tree.pose(q, "crank")[:3, :3].T @ tree.pose(q, "coupler")[:3, :3] @ np.diag([-1.0, -1, 1])
-    q_w = np.array([*q, *Rotation.from_matrix(turned).as_euler("ZYX")])
-    assert np.abs(weld.constraint(q_w)).max() < 1e-14
-    J = weld.constraint_jacobian(q_w)
-    assert off(J, pinocchios_jacobian(open_weld, q_w)) < CLOSE
-    # One freedom: the velocity is the null vector of J.
-    null = np.linalg.svd(J)[2][-1]
-    v_w = null / null[0] * v[0]
-    assert np.abs(v_w[:4] - v).max() < 1e-14
-    one, two = (
-        mb.simulate(x.dynamics(options=OWN), *state, 0.3, "rk853", rtol=1e-10, save=[0.3])
-        for x, state in ((lag, (q, v)), (weld, (q_w, v_w)))
-    )
-    assert np.abs(one.q - two.q[:, :4]).max() < 1e-10
 
 
 def loose(kind: str, gravity=(0.3, 0.2, -9.81)) -> mb.Model:
@@ -433,14 +389,6 @@ def test_a_loop_of_which_one_joint_is_moved():
         run = mb.simulate(lag.dynamics(options=OWN), q, v, 1.0, method, save=[0.5, 1.0], **how)
         # Its constraints say all of it, whatever the method.
         assert np.abs(run.q - [at_angle(0.2 + 3 * t)[1:] for t in run.t]).max() < 1e-14
-
-
-def test_a_catalog_system_keeps_its_symbols_while_it_is_moved():
-    cart_pole = mb.catalog.cart_pole()
-    lag = from_model(replace(cart_pole, prescribed=(Prescribed("x", rate=2.0),)))
-    m_c, m_p, l, th, w = sp.symbols("m_c m_p l theta thetadot")
-    assert sp.expand(lag.T - m_p * (l * w) ** 2 / 2 - 2 * m_p * l * w * sp.cos(th) - 2 * (m_c + m_p)) == 0
-    assert lag.time is None
 
 
 # What cannot be

@@ -124,15 +124,6 @@ def test_weight_that_actuators_hold(actuators: bool, more: str, lifted: str, tmp
     assert read.agrees
 
 
-def test_mujocos_own_steps_hold_the_weight_as_ours(tmp_path: Path) -> None:
-    model = mb.load(written(arm(), tmp_path))
-    dyn = mb.dynamics(model, "mujoco")
-    q, v = model.random_state(0)
-    ours, theirs = (mb.simulate(dyn, q, v, 0.1, method, 1e-3) for method in ("rk4", "mujoco_rk4"))
-    np.testing.assert_allclose(ours.q[-1], theirs.q[-1], rtol=0, atol=1e-9)
-    assert np.abs(ours.power_balance()).max() < 1e-6 * abs(ours.energy()[0])
-
-
 def test_a_held_weight_is_a_parameter_and_has_an_energy() -> None:
     b = hinge(mass=2.0, com=(0.5, 0, 0.1), axis=(0, -1, 0))
     b.add_gravity_compensation("a", mb.Parameter("c", 0.75))

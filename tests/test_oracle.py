@@ -151,37 +151,6 @@ def test_both_backends_agree(quantity, seed):
     assert size(ours - theirs) <= 1000 * EPS_113 * condition * size(ours)
 
 
-@pytest.mark.thorough("mpmath")
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_the_laws_of_mechanics_hold_to_thirty_digits(backend):
-    model = random_tree(1, 10)
-    q, v, _, tau = states(model, 2)
-    oracle = OracleDynamics(model, backend=backend)
-    mp = mpmath_context()
-    M, C, g, nle = (oracle.digits(n, *arguments(n, q, v, v, tau)) for n in CALLS if n in TERMS)
-    a = oracle.digits("forward_dynamics", q, v, tau)
-    passive = oracle.digits("passive", q, v)
-    damping = passive - oracle.digits("passive", q, 0 * v)
-    kinetic = oracle.digits("kinetic_energy", q, v)
-    condition = np.linalg.cond(oracle.mass_matrix(q)).max()
-    for k in range(2):
-        tolerance = 1000 * EPS_113 * size(M[k]) * max(1, size(v[k]) ** 2)
-        speed = np.array([mp.mpf(float(x)) for x in v[k]])
-        assert size(M[k] - M[k].T) <= tolerance
-        assert size(C[k] @ speed + g[k] - nle[k]) <= tolerance * 100
-        assert abs(speed @ M[k] @ speed / 2 - kinetic[k]) <= tolerance * model.nv
-        force = tau[k] + passive[k] - nle[k]
-        assert size(M[k] @ a[k] - force) <= 1000 * EPS_113 * condition * size(force)
-    # The derivative of the energies, where only q, v and a that are doubles can be given.
-    high, low = oracle.extended("inverse_dynamics", q, v, tau)
-    rate = oracle.digits("energy_rate", q, v, tau)
-    for k in range(2):
-        speed = np.array([mp.mpf(float(x)) for x in v[k]])
-        pushed = np.array([mp.mpf(float(h)) + mp.mpf(float(r)) for h, r in zip(high[k], low[k], strict=True)])
-        power = speed @ (pushed + damping[k])
-        assert abs(rate[k] - power) <= 1e-29 * size(high[k]) * size(v[k]) * model.nv
-
-
 TERMS = ("mass_matrix", "coriolis_matrix", "gravity", "nle")
 
 

@@ -106,17 +106,6 @@ def test_hamel_coefficients_are_those_of_the_inverse(curved):
         assert curved.hamel_coefficients[k, 1, 0] == -gamma
 
 
-def test_coordinates_rates_are_no_quasi_velocities():
-    T = m * (xdot**2 * (1 + y**2) + ydot**2) / 2 + m * y * xdot + x**2
-    whole = Lagrangian(T, x * y, [x, y], parameters=[m])
-    same = whole.quasi_velocities(sp.eye(2), ["a", "b"])
-    assert set(sp.flatten(same.hamel_coefficients)) == {0}
-    put = dict(zip(same.velocities, whole.velocities, strict=True))
-    for name in ("mass_matrix", "coriolis_matrix", "drift", "potential_gradient"):
-        difference = getattr(same.equations(), name).subs(put) - getattr(whole.equations(), name)
-        assert difference.applyfunc(sp.simplify).is_zero_matrix
-
-
 def test_kinematics_and_what_is_conserved(pair):
     _, quasi = pair
     assert [e.lhs for e in quasi.equations().kinematics()] == [u, w, s]
@@ -278,21 +267,6 @@ def test_every_method_knows_that_qdot_is_d_w(pair, method, compiled):
         assert lag.q[-1] == pytest.approx(run.q[-1], abs=1e-10)
 
 
-@pytest.mark.thorough("radau", "gauss6")
-@pytest.mark.parametrize("method", ["rk853", "radau", "gauss6", "rk4"])
-def test_time_damping_and_forces_in_quasi_velocities(curved, method):
-    q, v = np.array([0.4, -0.7]), np.array([0.3, 0.6])
-    whole = mb.simulate(
-        curved.system.dynamics(options={"compile": False}), q, curved.to_velocity(q, v), 0.5, "rk853",
-        rtol=1e-13, save=[0.0, 0.5],
-    )  # fmt: skip
-    given = {"dt": 5e-3, "save": 100} if method in FIXED else {"rtol": 1e-11, "save": [0.0, 0.5]}
-    run = mb.simulate(curved.dynamics(options={"compile": False}), q, v, 0.5, method, **given)
-    # Radau's tolerance is per step, rk4's error is of fourth order at 5 ms.
-    assert run.q[-1] == pytest.approx(whole.q[-1], abs=1e-8)
-    assert curved.to_velocity(run.q[-1], run.v[-1]) == pytest.approx(whole.v[-1], abs=1e-8)
-
-
 def test_torque_functions_and_their_work(pair):
     _, quasi = pair
     q, rates = np.array([0.1, 0.9, 0.2]), np.array([0.5, 2.0, -1.0])
@@ -324,18 +298,6 @@ def test_derivatives_are_along_the_columns(pair):
         # A central difference loses a third of the digits.
         assert by.q[:, k] == pytest.approx((ends[0] - ends[1]) / (2 * h), abs=1e-8)
     assert model.difference(q, model.integrate(q, v)) == pytest.approx(v, rel=1e-13)
-
-
-def test_batches_and_values(pair):
-    _, quasi = pair
-    rng = np.random.default_rng(0)
-    q, v = rng.uniform(0.4, 1.2, (3, 3)), rng.standard_normal((3, 3))
-    dyn = quasi.dynamics(options={"compile": False})
-    run = mb.simulate(dyn, q, v, 0.2, "rk4", dt=1e-2)
-    single = mb.simulate(dyn, q[1], v[1], 0.2, "rk4", dt=1e-2)
-    assert run.q[1] == pytest.approx(single.q, abs=1e-14)
-    assert quasi.model.velocity_names == ("w1", "w2", "w3")
-    assert dyn.at(I1=2.0).mass_matrix(q[0])[0, 0] == 2.0
 
 
 # What cannot be

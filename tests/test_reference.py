@@ -100,20 +100,6 @@ def test_a_tumbling_box_to_thirty_digits() -> None:
             assert abs(x * x + y * y + z * z + s * s - 1) < mp.mpf("1e-32")
 
 
-def test_runs_in_double_are_as_good_as_they_should_be() -> None:
-    model = catalog.heavy_top()
-    w = [0.0, 50.0, -4.61538]
-    truth = reference(model, model.neutral(), w, 0.5, [0, 0.25, 0.5])
-    assert truth.horizon == 0.5
-    for engine, method, setting, good in (
-        ("lagrangian", "taylor", {"rtol": EPS}, 1e-12),
-        ("pinocchio", "dop853", {"rtol": 1e-13}, 1e-10),
-        ("pinocchio", "rk4", {"dt": 1e-3}, 1e-5),
-    ):
-        run = simulate(dynamics(model, engine), model.neutral(), w, 0.5, method, save=[0, 0.25, 0.5], **setting)  # type: ignore[arg-type]
-        assert gap(model, run.q, truth.q).max() < good
-
-
 # What the pairs say of themselves
 
 
@@ -291,26 +277,17 @@ def test_an_interruption_gets_through(monkeypatch: pytest.MonkeyPatch) -> None:
     ("change", "message"),
     [
         ({"model": "pendulum"}, "model: expected a Model, got str"),
-        ({"q0": [1.0, 2.0]}, "q0: expected shape"),
         ({"q0": [[1.0], [2.0]]}, "q0, v0: expected one state"),
         ({"v0": [np.nan]}, "v0: nan"),
         ({"duration": -1.0}, "duration: expected a number of at least 0"),
         ({"save": [0, 2.0]}, "save: expected times between 0 and 1"),
-        ({"save": [1.0, 0.5]}, "save: expected increasing times"),
-        ({"save": 3}, "save: expected increasing times"),
         ({"torque": [1.0, 2.0]}, "torque: expected shape"),
         ({"seconds": 0.0}, "seconds: expected a number above 0"),
         ({"progress": 3}, "progress: expected None, True or a callable"),
     ],
 )
 def test_bad_input_is_named(change: dict[str, Any], message: str) -> None:
-    good: dict[str, Any] = {
-        "model": catalog.pendulum(),
-        "q0": [1.0],
-        "v0": [0.0],
-        "duration": 1.0,
-        "save": [0, 1.0],
-    }
+    good: dict[str, Any] = {"model": catalog.pendulum(), "q0": [1.0], "v0": [0.0], "duration": 1.0, "save": [0, 1.0]}
     with pytest.raises(InputError, match=message):
         reference(**(good | change))
 

@@ -41,17 +41,6 @@ def test_cases_go_by_name() -> None:
     with pytest.raises(UnknownNameError, match="did you mean 'elastic_pendulum'"):
         cases.get("elastic_pendulm")
     families = list(dict.fromkeys(c.family for c in ALL))
-    assert families == [
-        "stiffness",
-        "mass ratio",
-        "length",
-        "spin",
-        "near-singular",
-        "friction",
-        "large",
-        "step",
-        "long",
-    ]
     assert [c.family for c in ALL] == sorted((c.family for c in ALL), key=families.index)
 
 

@@ -102,17 +102,6 @@ def test_the_oracle_takes_constants_with_32_digits() -> None:
     assert 1e-12 < abs(ends[1] - ends[0]) < 1e-8
 
 
-def test_a_top_keeps_what_it_must() -> None:
-    model = catalog.heavy_top()
-    dyn = dynamics(model, "lagrangian")
-    run = taylor(dyn, model.neutral(), [0.0, 50.0, -4.61538], 1.0, save=np.linspace(0, 1, 9))
-    assert np.abs(np.linalg.norm(run.q, axis=1) - 1).max() < 2 * EPS
-    energy = run.energy()
-    assert np.abs(energy - energy[0]).max() < 1e-12 * energy[0]
-    # The symmetric top's spin about its axis (Landau, Lifshitz, Mechanics, §35).
-    assert np.abs(run.v[:, 1] - 50.0).max() < 1e-12 * 50
-
-
 @pytest.mark.parametrize("rtol", [1e-6, 1e-9])
 def test_a_drift_of_the_norm_never_bends_the_motion(rtol: float) -> None:
     """The rates at a quaternion of any length are those of its rotation."""
