@@ -529,5 +529,3 @@ def test_warnings_point_at_the_line_that_called(call):
         call(dynamics(model, "pinocchio"), [2.0], [1e155], 0.01, "rk4")
     assert len(heard) == 2
     assert {warning.filename for warning in heard} == {__file__}
-
-
