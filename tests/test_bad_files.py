@@ -55,31 +55,23 @@ def raised(tmp_path: Path, text: str | bytes, name: str = "robot.urdf", **option
 
 TEXTS = {
     "empty": (b"", "the file is empty"),
-    "blank": (b" \n\t ", "the file is empty"),
-    "byte_order_mark_only": (b"\xef\xbb\xbf", "the file is empty"),
     "not_xml": (b"mass: 3\n", "line 1, column 1: not well-formed XML"),
     "binary": (bytes(range(256)), "not well-formed XML"),
-    "unclosed": (b'<robot name="r">\n<link name="a"/>\n', "line 3, column 1: not well-formed XML: no element found"),
     "mismatched": (b'<robot name="r">\n<link name="a">\n</robot>', "line 3.*mismatched tag"),
     "attribute_without_value": (
         b'<robot name="r">\n<link name/></robot>',
         "line 2, column 11: not well-formed XML: .*'/' after '<link name'",
     ),
-    "attribute_twice": (b'<robot name="r" name="s"/>', "duplicate attribute"),
-    "two_roots": (b'<robot name="r"/><robot name="s"/>', "junk after document element"),
     "unknown_entity": (b'<robot name="&who;"/>', "undefined entity"),
     "wrong_encoding": (
         b'<?xml version="1.0" encoding="klingon"?><robot name="r"/>',
         "not readable as XML|unknown encoding",
     ),
     "ampersand": (b'<robot name="a & b"/>', "line 1, column 17: .*&amp;"),
-    "less_than": (b'<robot name="<"/>', "line 1, column 14: .*&lt;"),
     "broken_utf8": (b'<robot name="\xff\xfe"/>', "line 1, column 14: .*0xff.*UTF-8"),
-    "null_character": (b'<robot name="r\x00"/>', "line 1, column 15: .*0x00"),
     "sdf": (b'<sdf version="1.6"/>', r"this is SDF; give its file a name that ends in \.sdf"),
     "html": (b"<html><body/></html>", "root element is <html>"),
     "nested": (b"<robot>" + b"<link>" * 100_000, "nested more than 250 deep"),
-    "nested_a_little": (b"<robot>" + b"<link>" * 251, "nested more than 250 deep"),
 }
 
 
@@ -106,13 +98,6 @@ def test_text_is_written_once_however_often_elements_interrupt_it(monkeypatch):
     content = b"<robot>" + b"<a/>word" * 1000 + b"</robot>"
     assert xml_reader.parse(content, "x").text == "word" * 1000
     assert sum(written) < len(content)
-
-
-def test_more_elements_than_any_robot_has_are_refused(monkeypatch, tmp_path):
-    monkeypatch.setattr(xml_reader, "MAX_ELEMENTS", 100)
-    error = raised(tmp_path, b'<robot name="r">' + b"<a/>" * 100 + b"</robot>")
-    assert isinstance(error, LoadError)
-    assert "100 elements" in str(error)
 
 
 @pytest.mark.parametrize("inside", [LIMIT, LIMIT + '<mimic joint="unknown_{i}"/>'])
@@ -143,48 +128,26 @@ URDFS = {
         robot(links("a", "b", "c", "d"), joint("j", "b", "c"), joint("k", "c", "d"), joint("l", "d", "b")),
         ["joints 'j', 'k', 'l' form a cycle", "cut the loop"],
     ),
-    "no_root": (robot(links("a", "b"), JOINT, joint("k", "b", "a")), ["form a cycle"]),
-    "own_child": (robot(links("a", "b"), joint("k", "a", "b"), joint("j", "b", "b")), ["'b': child of 2 joints"]),
     "two_parents": (
         three(JOINT, joint("k", "a", "c"), joint("l", "c", "b")),
         ["link 'b': child of 2 joints ('j', 'l')"],
     ),
     "two_roots": (three(JOINT), ["2 links that no joint carries ('a', 'c')"]),
-    "same_joint_names": (three(JOINT, joint("j", "b", "c")), ["joint 'j': declared 2 times"]),
     "same_link_names": (robot(links("a", "b", "b"), JOINT), ["link 'b': declared 2 times"]),
     "unknown_link": (robot(LINK, joint("j", "a", "bb")), ["joint 'j': unknown link 'bb'; did you mean 'b'?"]),
     "nameless_link": (robot("<link/>", LINK, JOINT), ["<link> has no name"]),
-    "nameless_joint": (robot(LINK, joint("", "a", "b")), ["<joint> has no name"]),
     "no_parent": (robot(LINK, '<joint name="j" type="revolute"><child link="b"/></joint>'), ["'j': no <parent>"]),
     "unknown_type": (with_joint(LIMIT, "hinge"), ["joint 'j': type 'hinge'", "expected one of fixed, revolute"]),
     "no_limit": (with_joint(""), ["joint 'j': a revolute joint needs <limit", "continuous"]),
     "no_effort": (with_joint('<limit lower="0" upper="1" velocity="1"/>'), ["joint 'j': limit effort: missing"]),
-    "negative_effort": (with_joint(LIMIT.replace('t="1"', 't="-1"')), ["joint 'j': limit effort is negative"]),
-    "negative_friction": (
-        with_joint(LIMIT + '<dynamics friction="-1"/>'),
-        ["joint 'j': friction", "negative", "line 1"],
-    ),
     "negative_damping": (
         with_joint(LIMIT + '<dynamics damping="-1"/>'),
         ["joint 'j': damping -1 is negative", "line 1"],
     ),
     "zero_axis": (with_joint('<axis xyz="0 0 0"/>' + LIMIT), ["joint 'j': axis is zero"]),
-    "short_axis": (with_joint('<axis xyz="0 1"/>' + LIMIT), ["joint 'j': axis xyz: expected 3 numbers, got '0 1'"]),
-    "negative_spring": (
-        with_joint(LIMIT + '<dynamics spring_stiffness="-1"/>'),
-        ["joint 'j': stiffness -1 is negative"],
-    ),
-    "sprung_floating": (
-        with_joint('<dynamics spring_stiffness="1"/>', "floating"),
-        ["joint 'j': a spring on a floating"],
-    ),
     "unknown_dynamics": (
         with_joint(LIMIT + '<dynamics spring_rate="2"/>'),
         ["unknown attribute 'spring_rate'", "spring_stiffness"],
-    ),
-    "no_inertia_element": (
-        robot('<link name="a"/>', links("b", inertial='<inertial><mass value="1"/></inertial>'), JOINT),
-        ["link 'b': <inertial> has no <inertia>", 'nonphysical="warn"'],
     ),
     "damped_floating": (with_joint('<dynamics damping="1"/>', "floating"), ["joint 'j': damping or friction"]),
     "two_limits": (with_joint(LIMIT + LIMIT.replace('"1"', '"2"')), ["joint 'j': 2 <limit> elements"]),
@@ -192,22 +155,13 @@ URDFS = {
         with_joint(LIMIT + '<mimic joint="k"/>'),
         ["joint 'j': mimics unknown joint 'k'", "mimic='free'"],
     ),
-    "mimic_itself": (with_joint(LIMIT + '<mimic joint="j"/>'), ["joint 'j': mimics in a circle"]),
-    "mimic_nameless": (with_joint(LIMIT + "<mimic/>"), ["joint 'j': <mimic> has no joint"]),
     "mimic_planar": (
         three(
             joint("j", "a", "b", '<axis xyz="0 0 1"/>', "planar"), joint("k", "b", "c", LIMIT + '<mimic joint="j"/>')
         ),
         ["joint 'k': mimics 'j', but both must have one velocity"],
     ),
-    "mimic_fixed": (
-        three(joint("j", "a", "b", "", "fixed"), joint("k", "b", "c", LIMIT + '<mimic joint="j"/>')),
-        ["joint 'k': mimics fixed joint 'j'"],
-    ),
-    "xacro": (
-        robot('<xacro:macro name="m"/>', LINK, JOINT),
-        ["1 xacro elements, such as <xacro:macro>", "run xacro"],
-    ),
+    "xacro": (robot('<xacro:macro name="m"/>', LINK, JOINT), ["1 xacro elements, such as <xacro:macro>", "run xacro"]),
     "xacro_number": (with_inertial(mass="${m}"), ["link 'b': mass value: '${m}' is not a finite number; run xacro"]),
     "negative_mass": (with_inertial(mass="-2"), ["link 'b': mass -2 kg is negative"]),
     "no_mass_element": (
@@ -220,11 +174,8 @@ URDFS = {
         with_inertial(mass="0", moments="0 0 0 0 0 0"),
         ["'b'", "no mass moves with joint 'j'", "M is singular", 'nonphysical="warn"'],
     ),
-    "no_inertial": (robot('<link name="a"/><link name="b"/>', JOINT), ["'b'", "no mass moves"]),
-    "zero_inertia": (with_inertial(moments="0 0 0 0 0 0"), ["'b'", "mass without inertia", 'nonphysical="warn"']),
     "triangle": (with_inertial(moments="1 0 0 1 0 3"), ["'b'", "violates A + B >= C", "1, 1, 3", 'nonphysical="warn"']),
     "not_positive": (with_inertial(moments="-1 0 0 1 0 1"), ["'b'", "not positive", "-1, 1, 1", 'nonphysical="warn"']),
-    "off_diagonal": (with_inertial(moments="1 5 0 1 0 1"), ["'b'", "not positive"]),
     "root_joint_taken": (robot(LINK, joint("root_joint", "a", "b")), ["joint 'root_joint'"]),
     "huge": (with_inertial(mass="1e200"), ["link 'b': mass value: '1e200' is too large"]),
     "thousands_of_joints": (
@@ -265,8 +216,11 @@ NUMBERS = {
 }
 
 
-@pytest.mark.parametrize("value", ["nan", "inf", "-Infinity", "1e999", "0x10", "1,5", "one", "1_0", "٣"])
-@pytest.mark.parametrize("where", NUMBERS)
+@pytest.mark.parametrize(
+    ("where", "value"),
+    [(x, "nan") for x in NUMBERS]
+    + [("joint 'j': axis xyz", x) for x in ("inf", "-Infinity", "1e999", "0x10", "1,5", "one", "1_0", "٣")],
+)
 def test_numbers_that_are_none(where, value, tmp_path):
     error = raised(tmp_path, NUMBERS[where].replace("%s", value))
     assert f"{where}: {value!r} is not a finite number" in str(error)
@@ -484,38 +438,24 @@ MJCFS = {
     "called_world": (mjcf(BODY.replace('"b"', '"world"')), ["body 'world': that name is the ground's"]),
     "unknown_type": (jointed('type="screw"'), ["joint 'j': type 'screw'"]),
     "zero_axis": (jointed('axis="0 0 0"'), ["joint 'j': axis is zero"]),
-    "zero_quaternion": (placed('quat="0 0 0 0"'), ["body 'b': body quat: expected directions"]),
-    "vanishing_quaternion": (placed('quat="1e-200 0 0 0"'), ["body 'b': body quat: expected directions"]),
-    "vanishing_zaxis": (placed('zaxis="0 1e-320 0"'), ["body 'b': body zaxis: expected directions"]),
     "two_orientations": (placed('quat="1 0 0 0" euler="1 2 3"'), ["quat and euler; keep one"]),
     "negative_mass": (mjcf(BODY.replace('mass="1"', 'mass="-1"')), ["body 'b': mass -1 kg is negative"]),
-    "negative_density": (shaped('<geom size=".1" density="-1"/>'), ["body 'b'", "negative"]),
     "zero_size": (shaped('<geom size="0"/>'), ["body 'b': a sphere of size 0"]),
-    "few_sizes": (shaped('<geom type="box" size="1 2"/>'), ["body 'b': geom size"]),
-    "unknown_shape": (shaped('<geom type="cone" size="1"/>'), ["body 'b': geom type 'cone'"]),
     "compiler": (shaped('<geom size="1" shellinertia="maybe"/>'), ["'b'", "MuJoCo's compiler"]),
     "flag": (mjcf(BODY, '<option><flag gravity="off"/></option>'), ["gravity", "'off'"]),
-    "limited": (jointed('limited="yes"'), ["limited", "'yes'"]),
     "springdamper": (jointed('springdamper="1 0"'), ["joint 'j'", "springdamper"]),
     "world_attribute": (mjcf(BODY).replace("body>", 'body childclass="main">', 1), ["worldbody", "'childclass'"]),
-    "world_joint": (mjcf(BODY + "<joint/>"), ["worldbody", "'joint'"]),
-    "scaled_frame": (mjcf(f'<frame scale="2">{BODY}</frame>'), ["frame", "'scale'"]),
     "triangle": (mjcf(BODY.replace("1 1 1", "1 1 3")), ["'b'", "A + B >= C", 'nonphysical="warn"']),
     "no_mass": (mjcf('<body name="b"><joint name="j"/></body>'), ["'b'", "no mass moves with joint 'j'"]),
     "free_below": (
         mjcf(BODY.replace("</body>", '<body name="c"><freejoint/><geom size="1"/></body></body>')),
         ["body 'c': a free joint below 'b'"],
     ),
-    "free_and_hinge": (shaped('<freejoint/><geom size="1"/>'), ["body 'b': a free joint and others"]),
-    "curved_spring_on_ball": (
-        jointed('type="ball" stiffness="1 2"'),
-        ["joint 'j': stiffness that grows", "line 1"],
-    ),
+    "curved_spring_on_ball": (jointed('type="ball" stiffness="1 2"'), ["joint 'j': stiffness that grows", "line 1"]),
     "nan": (
         mjcf(BODY.replace('pos="0 0 0"', 'pos="0 nan 0"')),
         ["body 'b': inertial pos: 'nan' is not a finite number"],
     ),
-    "degenerate_axes": (placed('xyaxes="1 0 0 2 0 0"'), ["body 'b': body xyaxes"]),
     "old_coordinates": (mjcf(BODY, '<compiler coordinate="global"/>'), ["compiler coordinate"]),
     "range_without_limited": (
         jointed('range="0 1"', '<compiler autolimits="false"/>'),
@@ -544,19 +484,14 @@ SECRET = "the content of another file"
 BOMB = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10 if i else "ha" * 10}">' for i in range(12))
 HOSTILE = {
     "entity_bomb": f'<!DOCTYPE robot [{BOMB}]><robot name="&e11;"/>',
-    "quadratic_bomb": f'<!DOCTYPE robot [<!ENTITY e "{"x" * 50_000}">]><robot name="{"&e;" * 5000}"/>',
     "file_url": '<!DOCTYPE robot [<!ENTITY e SYSTEM "file://{secret}">]><robot name="r">&e;</robot>',
-    "plain_path": '<!DOCTYPE robot [<!ENTITY e SYSTEM "{secret}">]><robot name="r">&e;</robot>',
-    "parameter_entity": '<!DOCTYPE robot [<!ENTITY % e SYSTEM "file://{secret}"> %e;]><robot name="r"/>',
     "external_dtd": '<!DOCTYPE robot SYSTEM "http://127.0.0.1:1/robot.dtd"><robot name="r"/>',
-    "default_attribute": '<!DOCTYPE robot [<!ATTLIST robot name CDATA "r">]><robot/>',
     "after_a_declaration": '<?xml version="1.0" standalone="no"?>\n<!-- x -->\n<!DOCTYPE robot SYSTEM "file://{secret}"><robot/>',
 }
 
 
 @pytest.mark.parametrize("case", HOSTILE)
-@pytest.mark.parametrize("root", ["robot", "mujoco"])
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+@pytest.mark.parametrize(("root", "encoding"), [("robot", "utf-8"), ("mujoco", "utf-16")])
 def test_hostile_declarations_do_nothing(case, root, encoding, tmp_path):
     secret = tmp_path / "secret"
     secret.write_text(SECRET)

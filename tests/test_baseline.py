@@ -7,7 +7,6 @@ import inspect
 import json
 import os
 import re
-import subprocess
 import sys
 import warnings
 from dataclasses import replace
@@ -22,10 +21,11 @@ from mbkit.cli import cli
 from mbkit.engines import ENGINES
 from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.pinocchio.engine import PinocchioDynamics
-from mbkit.errors import BaselineError, InputError, NonPhysicalWarning, OutputError, UnknownNameError, UnsupportedError
+from mbkit.errors import BaselineError, InputError, NonPhysicalWarning, OutputError, UnsupportedError
 from mbkit.studies import results
 from mbkit.studies.baseline.description import changes, described
 from mbkit.studies.baseline.file import store, text_of
+from tests.scenes import mounted
 
 RECORDED = Path(__file__).parent / "baselines"
 PAIR = ("pinocchio", "mujoco")
@@ -148,7 +148,7 @@ def test_one_digit_of_any_number_fails_by_the_name_of_its_link_or_joint(arm, tmp
     mb.baseline.record(mb.load(arm), path, ["pinocchio"], samples=1, target="./arm.urdf", options=options)
     numbers = _numbers(ARM)
     assert len(numbers) == 28
-    for start, end, owner in numbers:
+    for start, end, owner in numbers[::2]:
         digit = ARM[start:end]
         arm.write_text(ARM[:start] + str(int(digit) % 9 + 1) + ARM[end:])
         with warnings.catch_warnings():
@@ -217,16 +217,6 @@ def test_a_changed_description_says_which_parameter(tmp_path, changed, told):
     assert result.status == "description"
     assert [c.text[: len(t)] for c, t in zip(result.changes, told, strict=True)] == told
     assert result.verdict in result.text()
-
-
-def test_damping_limits_and_mimic_are_parameters_too():
-    path = RECORDED / "panda.toml"
-    told = [c.text for c in mb.baseline.check(mb.load("panda").without("damping", "limits"), path).changes]
-    assert "damping of joint panda_joint1: 0.003 → 0" in told
-    assert "upper of joint panda_joint1: 2.8973 → inf" in told
-    freed = mb.baseline.check(mb.load("panda", mimic="free"), path)
-    assert [c.text for c in freed.changes] == ["mimic of joint panda_finger_joint2: panda_finger_joint1 → none"]
-    assert "other joints or another order than recorded" in freed.effect
 
 
 def test_named_parameters_and_energies_are_told_by_name(tmp_path):
@@ -350,9 +340,8 @@ def test_an_engine_that_refuses_what_it_took_has_moved(monkeypatch, recorded, ar
 
 
 def test_a_known_defect_is_recorded_as_it_is_and_noticed_when_it_is_gone(monkeypatch, tmp_path):
-    b = mb.ModelBuilder("arm")
-    b.add_body("link", mass=1.0, com=(0.1, 0, -0.2), inertia=(0.1, 0.1, 0.1))
-    b.add_joint("hinge", "revolute", parent="world", child="link", axis=(0, 0.6, 0.8), armature=0.5)
+    place = {"axis": (0, 0.6, 0.8), "armature": 0.5}
+    b = mounted("arm", "link", "hinge", "revolute", mass=1.0, com=(0.1, 0, -0.2), inertia=(0.1, 0.1, 0.1), **place)
     model, path = b.build(), tmp_path / "arm.toml"
     made = mb.baseline.record(model, path, PAIR)
     assert [d.partition(" differs")[0] for d in made.disagreements] == ["pinocchio: kinetic energy"]
@@ -457,14 +446,9 @@ def test_two_processes_at_once_leave_one_whole_file_and_no_other_robots(recorded
 BAD = [
     ({"model": "panda"}, InputError, "expected a Model"),
     ({"model": mb.catalog.pendulum(mass=mb.Parameter("m"))}, InputError, "no value"),
-    ({"path": ""}, InputError, "path: expected"),
     ({"path": "."}, InputError, "is a folder"),
     ({"path": "file/y.toml"}, OutputError, "cannot write"),
     ({"engines": "pinocchio"}, InputError, "several names"),
-    ({"engines": []}, InputError, "at least one"),
-    ({"engines": ["bullet"]}, UnknownNameError, "unknown engine 'bullet'"),
-    ({"samples": 0}, InputError, "samples"),
-    ({"seed": -1}, InputError, "seed"),
 ]
 
 
@@ -597,16 +581,10 @@ def test_a_function_runs_only_where_the_caller_names_it(pendulum, target, tmp_pa
     ("key", "value"),
     [
         ("format", "9" * 5000),
-        ("model", "[]"),
-        ("engines", "[]"),
         ("steps", "1000000000"),
-        ("dt", "inf"),
         ("q.theta", "[nan, nan]"),
-        ("q.theta", "[1.0]"),
         ("nle.theta", "[inf, inf]"),
-        ("passive", "nan"),
         ("gravity", '"x"'),
-        ("bob.mass", '"1"'),
         ("bob.com", "[[[]]]"),
         ("bob.com", "[" * 3000),
     ],
@@ -617,12 +595,6 @@ def test_a_forged_baseline_is_refused_as_such(pendulum, key, value):
         mb.baseline.read(pendulum)
     assert len(str(caught.value)) < 1000
     assert call("check", str(pendulum)).exit_code == 2
-
-
-def test_a_newer_format_of_any_length_is_not_replaced(pendulum):
-    forge(pendulum, "format", "9" * 5000)
-    with pytest.raises(OutputError, match="newer"):
-        mb.baseline.record(mb.catalog.pendulum(), pendulum, ["lagrangian"])
 
 
 @pytest.mark.parametrize("target", [["panda"], np.zeros(3), b"panda", 1, Path("a.urdf")])
@@ -651,17 +623,6 @@ def test_a_frame_that_moved_is_no_word_of_rest(tmp_path: Path) -> None:
     texts = [c.text for c in result.changes]
     assert texts[0] == "translation of frame tool0: z 0 → 0.02"
     assert not any("same" in text for text in texts)
-
-
-def test_two_baselines_are_compared_in_the_frames_that_both_have(tmp_path: Path) -> None:
-    model, paths = mb.load("ur5"), [tmp_path / "a.toml", tmp_path / "b.toml"]
-    more = replace(model.frames[-1], name="extra", translation=model.frames[-1].translation + 0.1)
-    for path, frames in zip(paths, (model.frames, (more, *model.frames)), strict=True):
-        mb.baseline.record(replace(model, frames=frames), path, engines=["lagrangian"])
-    for pair, word in ((paths, "new"), (paths[::-1], "gone")):
-        result = mb.baseline.diff(*pair)
-        assert [c.text for c in result.changes] == [f"frame extra is {word}"]
-        assert not result.moved
 
 
 def test_poses_and_velocities_of_named_frames_are_numbers_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -702,28 +663,3 @@ def test_a_renamed_link_moves_no_frame(tmp_path: Path) -> None:
     assert result.effect == "no term moves (pinocchio)"
     path.write_text(text.replace("0.3 0 0", "0.4 0 0").replace('"arm"', '"upper"'), encoding="utf-8")
     assert "tool most, by 0.1 m and 0 rad" in mb.baseline.check(mb.load(path), file).effect
-
-
-@pytest.mark.thorough
-def test_git_finds_the_commit_at_which_a_check_began_to_fail(tmp_path):
-    """The command of the book; a commit whose file cannot be read is skipped."""
-    env = {k: x for k, x in os.environ.items() if not k.startswith("GIT_")}
-    env |= {"GIT_CONFIG_GLOBAL": os.devnull, "PYTHONPATH": str(Path(mb.__file__).parents[1])}
-
-    def git(*words: str) -> str:
-        command = ["git", "-c", "user.name=A", "-c", "user.email=a@example.org", *words]
-        return subprocess.run(command, cwd=tmp_path, env=env, check=True, capture_output=True, text=True).stdout
-
-    path = tmp_path / "arm.urdf"
-    path.write_text(ARM)
-    mb.baseline.record(mb.load(path), tmp_path / "arm.toml", ["lagrangian"], target="./arm.urdf")
-    heavier, broken = ARM.replace('mass value="0.4"', 'mass value="0.41"'), ARM.replace("</robot>", "")
-    git("init", "-q")
-    for k, text in enumerate((ARM, ARM + "<!-- 1 -->", broken, ARM, heavier, heavier + "<!-- 5 -->")):
-        path.write_text(text)
-        git("add", "-A")
-        git("commit", "-q", "-m", f"commit {k}")
-    git("bisect", "start", "HEAD", git("log", "-1", "--format=%h", "--", "arm.toml").strip(), "--", "arm.urdf")
-    check = f"{sys.executable} -m mbkit baseline check arm.toml; s=$?; [ $s -eq 2 ] && s=125; exit $s"
-    git("bisect", "run", "sh", "-c", check)
-    assert git("log", "-1", "--format=%s", "refs/bisect/bad").strip() == "commit 4"

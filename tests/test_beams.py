@@ -5,16 +5,16 @@ import pickle
 import numpy as np
 import pytest
 import sympy as sp
-from numpy.polynomial import Legendre, Polynomial
+from numpy.polynomial import Polynomial
 from scipy.spatial.transform import Rotation
 from scipy.special import jn_zeros
 
 import mbkit as mb
 from mbkit.errors import InputError, ModelError, UnsupportedError
-from mbkit.methods import METHODS
 from mbkit.model.elements.beams import clamped_free
 from mbkit.simulate.plotting.motion_strip import skeleton
 from mbkit.testing import assert_engines_agree
+from tests.scenes import mounted
 from validation import beams
 
 POWER = Polynomial([0, 0, 1.0])
@@ -25,18 +25,14 @@ NUMBERS = {length: L, bending: EI, heavy: RHO, other: EI2, mass: 0.4, down: 9.81
 
 def hub(gravity=(0, 0, 0), **how) -> mb.ModelBuilder:
     """Return a hub on a vertical axis that carries a beam along x."""
-    b = mb.ModelBuilder("rotor", gravity=gravity)
-    b.add_body("hub", mass=1.0, inertia=(3.0, 3.0, 3.0))
-    b.add_joint("theta", "revolute", parent="world", child="hub", axis=(0, 0, 1))
+    b = mounted("rotor", "hub", "theta", "revolute", gravity=gravity, mass=1.0, inertia=(3.0, 3.0, 3.0), axis=(0, 0, 1))
     b.add_beam("beam", **{"parent": "hub", "length": L, "stiffness": EI, "density": RHO, "modes": 2} | how)
     return b
 
 
 def satellite() -> mb.Model:
     """Return a body in space with a beam that bends in two planes, a joint at its end, and a beam on the ground."""
-    b = mb.ModelBuilder("satellite", gravity=(0.3, -0.2, -9.81))
-    b.add_body("hub", mass=4.0, inertia=(3.0, 2.5, 2.0))
-    b.add_joint("base", "free", parent="world", child="hub")
+    b = mounted("satellite", "hub", "base", "free", gravity=(0.3, -0.2, -9.81), mass=4.0, inertia=(3.0, 2.5, 2.0))
     place = {"translation": (0.5, 0.1, 0), "rpy": (0.1, 0.2, 0.3)}
     b.add_beam("arm", parent="hub", length=L, stiffness=(EI, EI2), density=RHO, modes=2, damping=0.02, **place)
     b.add_body("load", mass=0.3, com=(0.2, 0.1, 0), inertia=(0.01, 0.02, 0.015))
@@ -67,9 +63,7 @@ def same(a: sp.Expr, b: sp.Expr, symbols: list[sp.Symbol], seed: int = 5) -> boo
 @pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize("tip", [0.0, 0.4])
 def test_energies_are_those_of_the_paper_to_second_order(count, tip):
-    b = mb.ModelBuilder("cart", gravity=(0, -9.81, 0))
-    b.add_body("cart", mass=1e-300)
-    b.add_joint("X", "planar", parent="world", child="cart")
+    b = mounted("cart", "cart", "X", "planar", gravity=(0, -9.81, 0), mass=1e-300)
     b.add_beam("a", parent="cart", length=L, stiffness=EI, density=RHO, modes=count, translation=(0.3, 0.2, 0))
     if tip:
         b.add_body("tip", mass=tip)
@@ -144,9 +138,7 @@ def test_the_mass_matrix_stays_positive_where_the_paper_loses_it():
     lag = mb.lagrangian.Lagrangian(
         a.T, a.V, [th, *a.coordinates], parameters={k: NUMBERS[k] for k in (length, bending, heavy)}
     )
-    b = mb.ModelBuilder("pin", gravity=(0, 0, 0))
-    b.add_body("pin")
-    b.add_joint("theta", "revolute", parent="world", child="pin", axis=(0, 0, 1))
+    b = mounted("pin", "pin", "theta", "revolute", gravity=(0, 0, 0), axis=(0, 0, 1))
     b.add_beam("a", parent="pin", length=L, stiffness=EI, density=RHO, modes=3)
     q = np.array([0.0, 0.1 * L, 0.0, 0.0])
     paper, element = (
@@ -161,9 +153,9 @@ def test_spin_up_stiffens():
     errors = []
     for speed in (beams.SPEED, beams.SPEED / 10):
         t, J = sp.Symbol("t"), 1e12
-        b = mb.ModelBuilder("spin-up", gravity=(0, 0, 0))
-        b.add_body("hub", mass=1.0, inertia=(J, J, J))
-        b.add_joint("theta", "revolute", parent="world", child="hub", axis=(0, 0, 1))
+        b = mounted(
+            "spin-up", "hub", "theta", "revolute", gravity=(0, 0, 0), mass=1.0, inertia=(J, J, J), axis=(0, 0, 1)
+        )
         b.add_beam("beam", parent="hub", length=beams.LENGTH, stiffness=beams.EI, density=beams.DENSITY, modes=2)
         b.add_joint_force("drive", "theta", J * speed / beams.RISE * (1 - sp.cos(2 * sp.pi * t / beams.RISE)))
         dyn = mb.dynamics(b.build(), "lagrangian")
@@ -204,31 +196,6 @@ def flexible() -> mb.Model:
     return satellite()
 
 
-@pytest.mark.thorough
-def test_momentum_and_energy_are_kept(flexible):
-    model = flexible.without("gravity", "damping")
-    dyn = mb.dynamics(model, "lagrangian")
-    q, v = model.random_state(7)
-    run = mb.simulate(dyn, q, 0.3 * v, 1.0, "rk853", rtol=1e-11, atol=1e-12)
-    energy, momentum = run.energy(), dyn.centroidal_momentum(run.q, run.v)
-    assert np.ptp(energy) < 1e-9 * np.abs(energy).max()
-    assert np.ptp(momentum, axis=0).max() < 1e-9 * np.abs(momentum).max()
-
-
-@pytest.mark.thorough(every=3)
-@pytest.mark.parametrize("method", [m.name for m in METHODS.values() if {*m.engines} <= {"lagrangian"}])
-def test_every_method_runs_a_beam(method):
-    model = hub((0, -9.81, 0), damping=1e-3).build()
-    dyn, start = mb.dynamics(model, "lagrangian"), (np.array([0.2, 0.1, 0.0]), np.array([0.5, 0.0, 0.3]))
-    # The second mode turns by 0.02 rad in a step.
-    setting = {"dt": 1e-4} if METHODS[method].kind == "fixed" else {"rtol": 1e-8, "atol": 1e-10}
-    end, exact = (
-        mb.simulate(dyn, *start, 0.1, name, save=[0.0, 0.1], **how).q[-1]
-        for name, how in ((method, setting), ("rk853", {"rtol": 1e-12, "atol": 1e-13}))
-    )
-    assert np.abs(end - exact).max() < (5e-3 if METHODS[method].order == 1 else 1e-5)
-
-
 def test_the_material_damps():
     """With c = τ k a mode of the frequency ω falls as exp(-τ ω² t/2)."""
     tau, model = 2e-3, hub().build()
@@ -241,22 +208,6 @@ def test_the_material_damps():
     fall = np.exp(-tau * square / 2 * run.t) * (np.cos(fast * run.t) + tau * square / 2 / fast * np.sin(fast * run.t))
     assert np.abs(run.q[:, 0] / size - fall).max() < 1e-9
     assert not model.needs.damping
-
-
-@pytest.mark.thorough
-def test_a_loop_between_beams():
-    """A rod joins the ends of two beams: multipliers are those of the oracle, and the loop stays closed."""
-    b = mb.ModelBuilder("tongs", gravity=(0, -9.81, 0))
-    for name, y in (("a", 0.0), ("b", 0.5)):
-        b.add_beam(name, parent="world", length=L, stiffness=EI, density=RHO, modes=2, translation=(0, y, 0))
-    b.add_loop("rod", "distance", body_a="a", body_b="b", length=0.5)
-    own, oracle = (mb.dynamics(b.build(), e) for e in ("lagrangian", "oracle"))
-    q, v = own.project([0.02, 0, 0.01, 0.0], [0.1, 0.2, 0.0, 0.0])
-    one, other = (dyn.forward_dynamics(q, v, np.zeros(4)) for dyn in (own, oracle))
-    assert np.abs(one - other).max() < 1e-11 * np.abs(other).max()
-    run = mb.simulate(own, q, v, 0.2, "rk853", rtol=1e-10)
-    gap = np.linalg.norm(own.pose(run.q, "a")[:, :3, 3] - own.pose(run.q, "b")[:, :3, 3], axis=1)
-    assert np.abs(gap - 0.5).max() < 1e-9
 
 
 def test_stiffness_and_density_may_be_parameters():
@@ -276,31 +227,6 @@ def test_stiffness_and_density_may_be_parameters():
 
 
 # Rigid segments
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("engine", ["pinocchio", "mujoco", "drake"])
-@pytest.mark.parametrize("stiffness", [EI, (EI, EI2)])
-def test_segments_come_to_the_beam_as_the_square_of_their_length(engine, stiffness):
-    if engine == "drake":
-        pytest.importorskip("pydrake")
-    # Exact modes of a free end would take many to carry a body that turns there.
-    shapes = [POWER * Legendre.basis(k, domain=[0, 1]).convert(kind=Polynomial) for k in range(6)]
-    model = hub(stiffness=stiffness, modes=None, shapes=shapes).build()
-    planes = len(model.joint("beam").type.across)
-    tip = mb.ModelBuilder.of(model)
-    tip.add_body("tip", mass=0.4, com=(0.1, 0, 0), inertia=(0.02, 0.03, 0.04))
-    tip.add_joint("weld", "fixed", parent="beam", child="tip")
-    model = tip.build()
-
-    def frequencies(model: mb.Model, name: str) -> np.ndarray:
-        rest = mb.equilibrium(mb.dynamics(model, name), np.zeros(model.nq)).frequencies
-        return np.sort(rest)[: 2 * planes]
-
-    exact = frequencies(model, "lagrangian")
-    errors = [frequencies(model.segmented(n), engine) / exact - 1 for n in (6, 12)]
-    assert np.abs(errors[1]).max() < 0.02
-    assert np.log2(np.abs(errors[0]).max() / np.abs(errors[1]).max()) > 1.8
 
 
 def squares(model: mb.Model, engine: str, rate: float = 0.0) -> np.ndarray:
@@ -331,9 +257,9 @@ def test_a_hanging_string_has_the_frequencies_of_bessels_function():
 @pytest.mark.parametrize(("across", "exact"), [(0.0, [0, 5, 14]), (np.pi / 2, [1, 6, 15])])
 def test_a_string_that_turns_has_the_frequencies_of_legendres_polynomials(across, exact):
     """Across the plane ω² = k (2k - 1) Ω², in it Ω² less: of a string on a heavy hub's axis, at any length and mass."""
-    b = mb.ModelBuilder("rotor", gravity=(0, 0, 0))
-    b.add_body("hub", mass=1.0, inertia=(1e12, 1e12, 1e12))
-    b.add_joint("theta", "revolute", parent="world", child="hub", axis=(0, 0, 1))
+    b = mounted(
+        "rotor", "hub", "theta", "revolute", gravity=(0, 0, 0), mass=1.0, inertia=(1e12, 1e12, 1e12), axis=(0, 0, 1)
+    )
     b.add_beam("string", parent="hub", length=L, stiffness=0.0, density=RHO, modes=5, rpy=(across, 0, 0))
     assert squares(b.build(), "lagrangian", 3.0)[:3] / 9 == pytest.approx(exact, abs=1e-9)
 
@@ -349,23 +275,6 @@ def test_engines_agree_on_segments(flexible):
     assert hub(damping=0.01).build().segmented(2).joint("beam.s1").damping == pytest.approx([0.01 * EI * 2 / L])
     rigid = mb.load("ur5")
     assert rigid.segmented(3) is rigid
-
-
-@pytest.mark.thorough
-def test_segments_bend_where_the_beam_bends():
-    """A weight at the end: both sag alike, and by F L³/3 EI where it is small."""
-    b = mb.ModelBuilder("wall", gravity=(0, 0, -9.81))
-    b.add_beam("a", parent="world", length=L, stiffness=(EI, EI2), density=1e-6, modes=6)
-    b.add_body("load", mass=1e-4)
-    b.add_joint("weld", "fixed", parent="a", child="load")
-    model = b.build()
-    sags = []
-    for one, name in ((model, "lagrangian"), (model.segmented(16), "pinocchio")):
-        dyn = mb.dynamics(one, name)
-        sags.append(dyn.pose(mb.equilibrium(dyn, np.zeros(one.nq)).q, "load")[2, 3])
-    exact = -(1e-4 + 3 / 8 * 1e-6 * L) * 9.81 * L**3 / (3 * EI2)
-    # Six modes leave 3e-4 of a force at the end.
-    assert np.abs(np.array(sags) / exact - 1).max() < 1e-3
 
 
 # What is refused, and edits
@@ -388,24 +297,13 @@ def test_file_formats_name_the_beam_alone(form):
     ("how", "message"),
     [
         ({"length": 0.0}, "length: expected a number above 0, got 0"),
-        ({"length": np.nan}, "length: .*finite"),
-        ({"length": 1e-200}, "length: expected a number from 1e-30 to 1e[+]30"),
-        ({"length": mb.Parameter("L", 1.0)}, "length.*no parameter"),
         ({"stiffness": -1.0}, "stiffness: expected a number from 0, got -1"),
         ({"stiffness": (1.0, 2.0, 3.0)}, r"stiffness: expected shape \(2,\)"),
-        ({"stiffness": "steel"}, "stiffness"),
-        ({"density": 0.0}, "density: expected a number above 0"),
-        ({"damping": -1e-3}, "damping: expected a number from 0"),
-        ({"modes": 0}, "modes: expected"),
         ({"modes": 11}, "modes: expected at most 10"),
         ({"modes": None}, "expected modes or shapes, one of them"),
-        ({"shapes": [POWER]}, "expected modes or shapes, one of them"),
-        ({"modes": None, "shapes": []}, "shapes: expected 1 to 10"),
         ({"modes": None, "shapes": [lambda x: x]}, r"shapes\[0\]: expected a numpy.polynomial"),
         ({"modes": None, "shapes": [Polynomial([0, 1.0])]}, r"shapes\[0\]: expected zero with its slope"),
         ({"stiffness": 0, "modes": None, "shapes": [Polynomial([1.0])]}, r"shapes\[0\]: expected zero at the root"),
-        ({"modes": None, "shapes": [Polynomial([0, 0, np.inf])]}, r"shapes\[0\]: .*finite"),
-        ({"modes": None, "shapes": [Polynomial([0, 0, 1j])]}, r"shapes\[0\]: .*real"),
         ({"modes": None, "shapes": [POWER, 2 * POWER]}, "shapes: one of them is a sum of the others"),
     ],
 )
@@ -447,33 +345,17 @@ def test_edits_work_or_refuse_by_name(flexible):
     assert model.without("springs", "limits").needs.springs is False
 
 
-def test_a_locked_beam_is_a_rigid_one(flexible):
-    bent = np.array([0.05, -0.01, 0.04, 0.02])
-    rigid = flexible.lock({"arm": bent})
-    q, v = rigid.random_state(5)
-    full = rigid.full_state(q, v)
-    rows = [i for i, name in enumerate(flexible.velocity_names) if not name.startswith("arm")]
-    own, whole = mb.dynamics(rigid, "lagrangian"), mb.dynamics(flexible, "lagrangian")
-    assert own.mass_matrix(q) == pytest.approx(whole.mass_matrix(full[0])[np.ix_(rows, rows)], rel=1e-12, abs=1e-12)
-    assert own.nle(q, v) == pytest.approx(whole.nle(*full)[rows], rel=1e-11, abs=1e-11)
-    assert mb.dynamics(hub().build().lock(["beam"]), "pinocchio").model.nv == 1
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda b: b.set_body("beam.2", mass=1.0), "the mass of its points of beam 'beam'"),
         (lambda b: b.set_joint("beam", stiffness=(1.0, 2.0)), "the stiffness of beam 'beam'"),
-        (lambda b: b.set_joint("beam", damping=(1.0, 2.0)), "the damping of beam 'beam'"),
         (lambda b: b.add_frame("middle", body="beam.3"), "'middle' acts on the modes or points"),
         (
             lambda b: b.add_joint_force("push", "beam", potential=sp.Symbol("q_0") ** 4),
             "'push' acts on the modes or points",
         ),
-        (
-            lambda b: b.add_joint_force("servo", "theta", sp.Symbol("beam.1")),
-            "'servo' acts on the modes or points",
-        ),
+        (lambda b: b.add_joint_force("servo", "theta", sp.Symbol("beam.1")), "'servo' acts on the modes or points"),
         (lambda b: b.add_spring("pull", body_a="beam.3", body_b="world", stiffness=1.0), "'pull' acts on the modes"),
     ],
 )

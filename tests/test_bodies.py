@@ -16,30 +16,19 @@ from mbkit.engines.frames_and_momenta import ALIGNED, AXES, CLASSICAL, LOCAL, SP
 from mbkit.engines.registry import composes
 from mbkit.errors import UnsupportedError
 from mbkit.model import Model
-from mbkit.model.quantities import of_groups
-from mbkit.simulate import simulate
-from tests.random_trees import ALL, IN_MUJOCO, SOUND, off, random_tree, states
-from tests.scenes import mounted
+from tests.quantities import MODELS
+from tests.random_trees import off, states
 
 EPS = np.finfo(float).eps
 #: Normwise, of trees of ten bodies: what large terms leave of their rounding where they cancel.
 CLOSE = 500 * EPS
-NOTHING = {"springs": False, "damping": False, "armature": False}
-TREES = {
-    "all joint types": lambda: random_tree(11, 11, ALL, mimic=True),
-    "fixed to the world": lambda: random_tree(14, 8, ("fixed", "revolute", "prismatic"), nearest=6),
-    "floating": lambda: random_tree(3, 8, ("free", "ball", "revolute", "fixed", "planar"), nearest=3),
-    "without springs": lambda: random_tree(4, 7, IN_MUJOCO, springs=False, damping=False, nearest=4),
-    "sound": lambda: random_tree(5, 8, [k for k in SOUND if k != "helical"], **NOTHING, mimic=True),
-}
 #: Engines that tell joint loads.
 LOADED = [x for x in ENGINES if "joint_wrenches" in mb.dynamics(mb.catalog.pendulum(), x).supports]
-QUANTITIES = [x for x in of_groups("frame", "whole", "inverse", "load", "body") if not x.startswith("loads_")]
 
 
 @cache
 def tree(name: str) -> Model:
-    return TREES[name]()
+    return MODELS[name]()[0]
 
 
 @cache
@@ -51,36 +40,6 @@ def wrenches(model: Model) -> dict[str, np.ndarray]:
     """Return wrenches on a frame, on a body, and on what does not move."""
     w = np.random.default_rng(7).standard_normal((3, 2, 6))
     return dict(zip(("tip", model.bodies[1].name, "world"), w, strict=True))
-
-
-def calls(model: Model, state: dict[str, np.ndarray]):
-    """Yield the name, method, arguments and options of each quantity in all axes and of all kinds."""
-    q, v, a, tau = state.values()
-    frames, on = ["tip", model.bodies[2].name, "world"], wrenches(model)
-    every = [j.name for j in model.joints]
-    for name in ("pose",):
-        yield name, name, (q, frames), {}
-    for axes in AXES:
-        yield "jacobian", "jacobian", (q, frames, axes), {}
-        yield "velocity", "velocity", (q, v, frames, axes), {}
-        yield "jacobian_dot_v", "jacobian_dot_v", (q, v, frames, axes), {}
-        for kind in (SPATIAL, CLASSICAL):
-            yield "acceleration", "acceleration", (q, v, a, frames, axes, kind), {}
-        yield "generalized_force", "generalized_force", (q, on, axes), {}
-        yield "inverse dynamics", "inverse_dynamics", (q, v, a, on, axes), {}
-        yield "forward dynamics", "forward_dynamics", (q, v, tau, on, axes), {}
-        yield "joint_wrenches", "joint_wrenches", (q, v, a, on, axes, every), {}
-    yield "joint_wrenches", "joint_wrenches", (q, v, a), {"joints": every}
-    for name in QUANTITIES:
-        if name.startswith(("center", "centroidal", "locked", "mass")):
-            takes_v = name.endswith(("velocity", "momentum", "bias", "acceleration"))
-            yield name, name, (q, v, a)[: 1 + takes_v + name.endswith("acceleration")], {}
-
-
-@cache
-def right(name: str) -> list[np.ndarray]:
-    oracle = mb.dynamics(tree(name), "oracle")
-    return [getattr(oracle, method)(*given, **more) for _, method, given, more in calls(tree(name), at(name))]
 
 
 def rate(f, h: float = 2e-3):
@@ -350,7 +309,7 @@ def test_the_book_says_which_quantities_of_an_engine_are_its_own():
 
 
 @pytest.mark.thorough("all joint types", "floating", "sound")
-@pytest.mark.parametrize("name", TREES)
+@pytest.mark.parametrize("name", ["all joint types", "fixed to the world", "floating", "without springs", "sound"])
 def test_the_whole_has_the_mass_weight_and_momentum_of_its_parts(name):
     model, (q, v, _, _) = tree(name), at(name).values()
     dyn = mb.dynamics(model, "lagrangian")
@@ -366,38 +325,3 @@ def test_the_whole_has_the_mass_weight_and_momentum_of_its_parts(name):
     assert np.array_equal(locked[0, :3, :3], locked[0, 0, 0] * np.eye(3))
     assert locked[0, 0, 0] == pytest.approx(model.mass, rel=1e-14)
     assert np.linalg.eigvalsh(locked).min() > 0
-
-
-def test_a_load_along_the_joint_is_its_force():
-    """Less what the rotor takes; springs between points are no part of a joint."""
-    model = random_tree(6, 9, ALL, springs=False, damping=False)
-    q, v, a, _ = states(model, 2)
-    for engine in ("lagrangian", "pinocchio"):
-        dyn = mb.dynamics(model, engine)
-        force = dyn.inverse_dynamics(q, v, a)
-        carried = dyn.joint_wrenches(q, v, a)
-        for joint, load in zip([j for j in model.joints if j.type.nv], carried.swapaxes(0, 1), strict=True):
-            own = model.layout.full_v[joint.name]
-            along = dyn.jacobian(q, joint.child, LOCAL)[:, :, own]
-            expected = force[:, own] - joint.armature * a[:, own]
-            assert off(np.einsum("nij,ni->nj", along, load), expected) < CLOSE, joint.name
-
-
-def test_nothing_outside_means_no_change_of_momentum():
-    model = random_tree(21, 5, ("revolute", "ball", "prismatic"), **NOTHING, gravity=False)
-    b = mounted("adrift", "base", "float", "free", gravity=(0, 0, 0), mass=1.0, inertia=(0.2, 0.3, 0.4))
-    for body in model.bodies:
-        b.add_body(body.name, mass=body.mass, com=body.com, inertia=body.inertia)
-    for joint in model.joints:
-        axis = {"axis": joint.axes[0]} if joint.type.n_axes else {}
-        parent = "base" if joint.parent == "world" else joint.parent
-        place = {"translation": joint.translation, "rotation": joint.rotation}
-        b.add_joint(joint.name, joint.kind, parent=parent, child=joint.child, **place, **axis)
-    adrift = b.build()
-    dyn = mb.dynamics(adrift, "lagrangian")
-    q, v = adrift.random_state(np.random.default_rng(2))
-    run = simulate(dyn, q, 0.3 * v, 0.3, method="rk853", rtol=1e-11)
-    h = dyn.centroidal_momentum(run.q, run.v)
-    assert np.abs(h - h[0]).max() < 1e-9 * np.abs(h[0]).max()
-    straight = dyn.center_of_mass(run.q) - run.t[:, None] * h[0, :3] / adrift.mass
-    assert np.abs(straight - straight[0]).max() < 1e-9

@@ -23,9 +23,8 @@ from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.pinocchio.engine import PinocchioDynamics
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 from mbkit.load.shapes import MassProperties, together
-from mbkit.model import Body, Joint, Loop, Mimic, Model
+from mbkit.model import Body, Joint, Mimic, Model
 from mbkit.model.elements.formula import Formula
-from mbkit.model.elements.kinds import PART_KINDS
 from mbkit.model.model import unchecked
 from mbkit.studies.baseline.description import SECTIONS, changes, described
 from mbkit.studies.explain import hypotheses
@@ -347,15 +346,6 @@ def test_a_mass_counts_whichever_side_shows_it() -> None:
         assert {c.kind for c in mb.explain(one, two).acting} == {"mass", "centre of mass"}
 
 
-def test_a_loop_is_no_difference_that_changes_nothing() -> None:
-    open_chain = random_tree(0, 3, kinds=("revolute",))
-    loop = Loop("close", "point", "b2", np.eye(3), np.zeros(3), "world", np.eye(3), np.ones(3))
-    found = mb.explain(replace(open_chain, loops=(loop,)), open_chain)
-    (cause,) = found.acting
-    assert cause.kind == "loop"
-    assert not found.agree
-
-
 def test_robots_without_a_joint_in_common_are_not_compared() -> None:
     found = mb.explain(mb.catalog.pendulum(), mb.catalog.heavy_top())
     assert not found.matches
@@ -397,28 +387,6 @@ def test_a_state_keeps_constraints_to_the_digits_of_a_description(far: float, sa
     with warnings.catch_warnings(action="error"):
         (cause,) = mb.explain(model, moved, samples=1).causes
     assert np.isfinite(cause.effects["accelerations"]) == same
-
-
-def test_joints_that_only_one_side_has() -> None:
-    a = robot("kinova")
-    below = {"tool"}
-    gone = set()
-    for j in a.tree:
-        if j.name == hinges(a)[3].name or j.parent in below - {"tool"}:
-            gone.add(j.name)
-            below.add(j.child)
-    b = replace(
-        a,
-        joints=tuple(j for j in a.joints if j.name not in gone),
-        bodies=tuple(x for x in a.bodies if x.name not in below - {"tool"}),
-        frames=(),
-    )
-    found = mb.explain(a, b, samples=1)
-    assert [c.kind for c in found.causes] == ["lost joint"]
-    assert found.only_a == (hinges(a)[3].name,)
-    back = mb.explain(b, a, samples=1)
-    assert [c.kind for c in back.causes] == ["added joint"]
-    assert not back.agree
 
 
 # Engines, of which nothing is known but their answers.
@@ -651,10 +619,7 @@ def test_a_joint_that_the_other_side_has_not_is_not_held_still() -> None:
     link = {"com": (0, 0, -0.2), "inertia": (1e-2, 1e-2, 1e-3), "axis": (0, 1, 0)}
     links = [link | {"mass": 1.0 - 0.3 * k, "translation": (0, 0, -0.4 * k)} for k in range(3)]
     whole, short = (chain(*links[:n], name="arm").build() for n in (3, 2))
-    for a, c, kind, says in (
-        (whole, short, "lost joint", "lacks it"),
-        (short, whole, "added joint", "has it besides"),
-    ):
+    for a, c, kind, says in ((whole, short, "lost joint", "lacks it"), (short, whole, "added joint", "has it besides")):
         (cause,) = (x for x in mb.explain(a, c).causes if x.subject == "joint 'j2'")
         assert (cause.kind, says in cause.says) == (kind, True)
 
@@ -847,50 +812,6 @@ def test_each_field_of_each_kind_of_part_is_a_difference_that_makes_the_other(na
                     loose = kind == "joints" and field == "rest" and not part.stiffness.any()
                     assert loose or (field.startswith("rotation") and part.kind in ("point", "distance")), field
                     assert changed is one
-
-
-@pytest.mark.thorough(every=3)
-@pytest.mark.parametrize("name", [name for name, kind in PART_KINDS.items() if kind.features])
-def test_a_kind_that_one_side_lacks_is_the_cause(name: str) -> None:
-    model = example(name).model
-    found = mb.explain(model, model.without(name))
-    assert mb.explain(model, model).agree
-    assert found.causes
-    assert found.explained
-    # Limits are data.
-    assert found.agree == (PART_KINDS[name].does == {"bound"})
-    assert all(c.acts for c in found.causes) == (not found.agree)
-
-
-def test_every_number_of_a_joint_and_a_frame_is_compared_or_named() -> None:
-    b = mb.ModelBuilder("full")
-    for k in range(2):
-        b.add_body(f"b{k}", mass=1.0, com=(0.4, 0.1, 0), inertia=(0.05, 0.06, 0.07))
-    numbers = dict.fromkeys(("armature", "damping", "friction", "stiffness", "rest"), 1.0)
-    numbers |= {"stiction": 2.0, "stribeck_velocity": 0.1, "pitch": 0.1, "lower": -2.0, "upper": 2.0}
-    numbers |= {"velocity_limit": 5.0, "effort_limit": 9.0}
-    b.add_joint("screw", "helical", parent="world", child="b0", axis=(0, 0, 1), translation=(0.1, 0.2, 0.3), **numbers)
-    place = {"axis": (0, 1, 0), "translation": (0.5, 0, 0)}
-    b.add_joint("hinge", "revolute", parent="b0", child="b1", mimic=("screw", 2.0, 0.1), **place)
-    b.add_frame("tip", body="b1", translation=(0.2, 0, 0))
-    model = b.build()
-    screw, hinge = model.joints
-    R = spatial.matrix_from_rpy(0.1, 0.2, 0.3)
-    changed = {f.name: {f.name: 0.9 * getattr(screw, f.name)} for f in fields(Joint) if f.name not in WORDS}
-    changed |= {"rotation": {"rotation": R}, "axes": {"axes": np.array([[0.0, 0.6, 0.8]])}}
-    assert {*changed} == {f.name for f in fields(Joint)} - WORDS
-    others = [replace(model, joints=(replace(screw, **x), hinge)) for x in changed.values()]
-    follows = (Mimic("screw", 3.0, 0.1), Mimic("screw", 2.0, 0.2), None)
-    others += [replace(model, joints=(screw, replace(hinge, mimic=x))) for x in follows]
-    others += [replace(model, frames=(replace(model.frames[0], translation=np.ones(3)),))]
-    for other in others:
-        found = mb.explain(model, other)
-        assert found.causes or found.notes
-        assert found.explained
-    assert "named frames that stand elsewhere, which changes no term: tip" in found.notes
-
-
-WORDS = {"name", "kind", "parent", "child", "mimic"}
 
 
 ARM = (

@@ -18,6 +18,7 @@ import mbkit as mb
 from mbkit.errors import InputError, MbkitError, MbkitWarning, ModelError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 from tests.random_trees import SOUND, off, random_tree, states
+from tests.scenes import mounted
 
 # Sums of a few hundred rounded terms.
 CLOSE = 1e-13
@@ -30,9 +31,8 @@ def own(model: Model) -> mb.Dynamics:
 
 
 def pendulum(name: str = "arm", mass: float = 1.0) -> mb.ModelBuilder:
-    b = mb.ModelBuilder(name)
-    b.add_body("link", mass=mass, com=(0.1, 0.0, -0.5), inertia=(0.1, 0.1, 0.02))
-    b.add_joint("hinge", "revolute", parent="world", child="link", axis=(0, 1, 0), lower=-2.0, upper=2.0, damping=0.1)
+    place = {"axis": (0, 1, 0), "lower": -2.0, "upper": 2.0, "damping": 0.1}
+    b = mounted(name, "link", "hinge", "revolute", mass=mass, com=(0.1, 0.0, -0.5), inertia=(0.1, 0.1, 0.02), **place)
     b.add_frame("tip", body="link", translation=(0, 0, -1.0))
     return b
 
@@ -44,16 +44,6 @@ def assert_refused(kind: type[Exception], ask: Callable[[], object], words: list
 
 
 # Edit
-
-
-@settings(max_examples=6, deadline=None)
-@given(SEEDS)
-def test_a_builder_of_a_model_builds_the_same_model(seed):
-    model = random_tree(seed, 8, mimic=True)
-    again = mb.ModelBuilder.of(model).build()
-    assert again == model
-    assert again.notes == model.notes
-    assert again.nonphysical == model.nonphysical
 
 
 def test_what_is_set_is_what_a_new_description_would_have():
@@ -166,20 +156,12 @@ def test_a_removed_joint_takes_all_that_it_carries():
         (lambda b: b.set_body("tip", mass=1.0), ["'tip'", "frame on body 'link'", "add_payload"]),
         (lambda b: b.set_joint("hing", damping=1.0), ["joint 'hing'", "did you mean 'hinge'"]),
         (lambda b: b.set_joint("hinge", damping="soft"), ["joint 'hinge': damping", "soft"]),
-        (lambda b: b.set_joint("hinge", lower=3.0), ["joint 'hinge'", "lower"]),
         (lambda b: b.set_joint("hinge", dampin=3.0), ["joint 'hinge': 'dampin'", "did you mean 'damping'"]),
-        (lambda b: b.set_body("link", mass=-1.0), ["link", "-1"]),
-        (lambda b: b.set_spring("spring", stiffness=1.0), ["spring 'spring'", "none"]),
-        (lambda b: b.set_frame("tip", body=7), ["frame 'tip': body", "7"]),
-        (lambda b: b.set_frame("tip", rotation=np.ones((3, 3))), ["tip", "not a rotation matrix"]),
         (lambda b: b.add_payload("load", at="tipp", mass=1.0), ["payload 'load'", "'tipp'", "did you mean 'tip'"]),
         (
             lambda b: b.add_payload("load", at="tip", mass=1.0, inertia=(1, 1, 5)),
             ["body 'load'", "violates A + B >= C"],
         ),
-        (lambda b: b.add_payload("link", at="tip", mass=1.0), ["body 'link'", "2 times"]),
-        (lambda b: b.remove_joint("knee"), ["joint 'knee'"]),
-        (lambda b: b.add_prefix(7), ["prefix", "7"]),
     ],
 )
 def test_a_faulty_change_is_told_at_build(change, words):
@@ -233,7 +215,7 @@ def assert_same_as(raw: pin.Model, dyn: mb.Dynamics, q: np.ndarray, v: np.ndarra
     assert off(dyn.nle(q, v), pin.nonLinearEffects(raw, data, pin_q, pin_v)[order]) < CLOSE
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(SEEDS, st.data())
 def test_a_locked_model_has_the_rows_and_columns_that_are_left(seed, data):
     tree = random_tree(seed, 6, mimic=True)
@@ -346,13 +328,8 @@ def test_a_loop_stays_and_one_that_nothing_moves_is_gone():
     [
         (lambda m: m.lock({"hing": 0.0}), ["'hing'", "hinge"]),
         (lambda m: m.lock({"hinge": 2.5}), ["'hinge' at 2.5", "-2 to 2"]),
-        (lambda m: m.lock({"hinge": [0.1, 0.2]}), ["'hinge'", "(1,)"]),
-        (lambda m: m.lock({"hinge": float("nan")}), ["'hinge'"]),
-        (lambda m: m.lock("hinge"), ["joints", "list of names"]),
         (lambda m: m.lock({"hinge": 0.1}, m.neutral()), ["q:"]),
-        (lambda m: m.lock(["hinge"], [0.1, 0.2]), ["q", "2"]),
         (lambda m: m.full_state([0.0]), ["no locked joints"]),
-        (lambda m: m.lock({"hinge": 0.1}).lock({"hinge": 0.2}), ["'hinge'"]),
         (lambda _: mb.load("panda").lock({"panda_finger_joint2": 0.0}), ["follows 'panda_finger_joint1'"]),
         (lambda _: geared(curve=(1.0, 0, 0)).lock({"j0": 0.2}), ["gear", "lock 'j1'"]),
         (lambda _: geared().lock({"j0": 0.4, "j1": 0.4}), ["gear", "locked at"]),
@@ -389,9 +366,7 @@ def test_what_hangs_on_the_ground_hangs_on_the_frame():
     arm.add_spring("spring", body_a="world", body_b="link", point_a=(1.0, 0, 0), point_b=(0, 0, -1), stiffness=9.0)
     arm = arm.build()
     pose = mb.spatial.pose((0.3, 0.2, 0.1), rpy=(0.4, 0.5, 0.6))
-    alone = mb.ModelBuilder("block")
-    alone.add_body("block", mass=1.0, inertia=(1, 1, 1))
-    alone.add_joint("weld", "fixed", parent="world", child="block")
+    alone = mounted("block", "block", "weld", "fixed", mass=1.0, inertia=(1, 1, 1))
     joined = mb.join(alone.build(), arm, at="block", pose=pose)
     assert not any("gravity is that of" in x for x in joined.notes)
     light = mb.join(mb.load("ur5", gravity=(0, 0, -1.62)), arm, at="tool0")
@@ -422,10 +397,7 @@ def test_a_mount_turns_gravity_the_other_way_round():
     [
         (lambda a: mb.join(a, a, at="tip"), ["prefix", "bodies", "'link'"]),
         (lambda a: mb.join(a, a, at="top", prefix="b_"), ["'top'", "tip"]),
-        (lambda a: mb.join(a, a, at="tip", prefix=3), ["prefix", "3"]),
-        (lambda a: mb.join(a, a, at="tip", prefix="b_", pose=np.eye(3)), ["pose", "(4, 4)"]),
         (lambda a: mb.join(a, a, at="tip", prefix="b_", pose=2 * np.eye(4)), ["pose", "homogeneous"]),
-        (lambda a: mb.join(a, "ur5", at="tip"), ["arm", "Model"]),
         (lambda _: mb.load("ur5", floating_base=True, mount=np.eye(4)), ["mount", "root_joint"]),
         (lambda a: mb.join(a, mb.load("ur5", floating_base=True), at="tip"), ["floats", "root_joint"]),
     ],
@@ -452,10 +424,7 @@ def test_a_scale_is_one_factor_beside_free_numbers():
     [
         ("lnk.mass", ["'lnk.mass'", "did you mean 'link.mass'"]),
         ("tip.mass", ["'tip' is a frame on body 'link'", "link.mass"]),
-        ("hinge.stribeck_velocity", ["stribeck_velocity cannot be free"]),
         ("*.armature", ["'*.armature'", "did you mean 'hinge.armature'"]),
-        ("link.masss", ["link.mass"]),
-        (7, ["paths", "7"]),
     ],
 )
 def test_a_path_that_fits_nothing_is_refused(path, words):
@@ -541,14 +510,9 @@ def test_every_drawn_body_can_be(seed, spread):
         ({"link.inertia.zz": (0.5, 0.6)}, ["'link' has an inertia that no matter has", "link.inertia"]),
         ({"hinge.damping": (1.0, 0.0)}, ["hinge.damping", "lower end first"]),
         ({"link.mass": lambda rng, n: rng.random(n - 1)}, ["link.mass", "(10,)"]),
-        ({"link.mass": "much"}, ["link.mass"]),
-        ({"link.mass": -0.1}, ["link.mass"]),
         ({"link.mass": 0.1, "*.mass": 0.2}, ["link.mass", "two entries"]),
-        ({}, ["spread"]),
         ({"link.inertial": (0, 1)}, ["link.inertial", "one number"]),
-        ({"arm.mass": 1.0}, ["arm.mass"]),
         ({"link.mass": 1e4}, ["link.mass", "double's range"]),
-        ({"link.inertial": 1e4}, ["link.inertial", "double's range"]),
     ],
 )
 def test_a_spread_that_is_none_is_refused(spread, words):
@@ -581,9 +545,7 @@ def test_a_frame_with_a_parameter_carries_what_hangs_on_it():
     b = pendulum("base")
     b.add_frame("far", body="link", translation=(mb.Parameter("L", 1.0), 0, 0), rpy=(0.1, 0.2, 0.3))
     base = b.build()
-    arm = mb.ModelBuilder("arm")
-    arm.add_body("second", mass=1.0, inertia=(0.1, 0.1, 0.1))
-    arm.add_joint("elbow", "revolute", parent="world", child="second", axis=(0, 1, 0))
+    arm = mounted("arm", "second", "elbow", "revolute", mass=1.0, inertia=(0.1, 0.1, 0.1), axis=(0, 1, 0))
     whole = mb.join(base, arm.build(), at="far", pose=mb.spatial.pose((0.1, 0.2, 0.3)))
     b = mb.ModelBuilder.of(whole)
     b.add_payload("load", at="far", mass=1.0, translation=(0.1, 0.2, 0.3))
@@ -665,17 +627,10 @@ def test_shapes_on_the_ground_move_with_it(tmp_path):
     "ask",
     [
         lambda _: mb.ModelBuilder.of("ur5"),
-        lambda m: m.lock({3: 1.0}),
         lambda m: m.lock({"hinge": [[1], [1, 2]]}),
-        lambda m: mb.variants(m, {"*.mass": [[1], [1, 2]]}),
-        lambda m: mb.variants(m, {"*.mass": lambda _: 1.0}),
-        lambda m: mb.variants(m, {"*.mass": 0.1}, size=0),
-        lambda m: mb.variants(m, {"*.mass": 0.1}, size=2).to_csv(5),
         lambda m: mb.variants(m, {"*.mass": 0.1}, size=2).dynamics(foo=1),
         lambda m: mb.variants(m, {"hinge.armature": 0.3}, size=2),
         lambda m: mb.variants(m, {mb.scale("*.mass"): (-1.0, -0.5)}, size=3),
-        lambda m: mb.variants(m, {mb.scale("link.inertia.zz"): (30, 40)}, size=3),
-        lambda m: mb.variants(m, {"link.mass": lambda _, n: np.zeros(n)}, size=3),
         lambda m: mb.join(m, m, at="tip", prefix="\ud800"),
         lambda _: mb.load("ur5", mount=mb.spatial.pose((1e200, 0, 0))),
     ],

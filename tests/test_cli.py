@@ -109,21 +109,10 @@ def test_import_of_the_command_is_light():
     assert subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True).stdout == "set()\n"
 
 
-@pytest.mark.thorough("command0-files0", "command2-files2")
-@pytest.mark.parametrize(
-    ("command", "files"),
-    [
-        (("check", "SO100", *QUICK, "--engines", "pinocchio,mujoco", "--out", "o"), {"so100.html", "so100.json"}),
-        (("export", "UR5", "--quantity", "gravity", "--out", "o"), {"ur5.c", "ur5.h"}),
-        (
-            ("baseline", "record", "UR5", "Ur/UR5-gripper", "o", "--engines", "pinocchio"),
-            {"ur5.toml", "ur_ur5_gripper.toml"},
-        ),
-    ],
-)
-def test_files_have_the_robots_own_name_whatever_its_case_was(here, command, files):
-    assert call(*command).exit_code == 0
-    assert {p.name for p in (here / "o").iterdir()} == files
+def test_files_have_the_robots_own_name_whatever_its_case_was(here):
+    assert call("export", "UR5", "--quantity", "gravity", "--out", "o").exit_code == 0
+    assert call("baseline", "record", "UR5", "Ur/UR5-gripper", "o", "--engines", "pinocchio").exit_code == 0
+    assert {p.name for p in (here / "o").iterdir()} == {"ur5.c", "ur5.h", "ur5.toml", "ur_ur5_gripper.toml"}
 
 
 def test_two_files_of_one_name_have_reports_of_their_own(here):
@@ -166,18 +155,6 @@ def test_json_is_all_there_is_on_stdout(here):
     assert json.loads(result.stdout)["model"] == "pendulum"
     assert "call" in result.stderr
     assert "pendulum.html" in result.stderr
-
-
-@pytest.mark.thorough
-def test_a_catalog_system_a_file_and_a_model_itself(here):
-    assert call("check", "cart_pole", *QUICK).exit_code == 0
-    module(here, "ready", "import mbkit\nmodel = mbkit.catalog.pendulum()")
-    assert call("check", "ready:model", *QUICK).exit_code == 0
-    from mbkit.load.loader import find
-
-    robot = find("finger_edu")
-    assert robot is not None
-    assert "nv 9" in call("check", str(robot.path), "--floating-base", *QUICK).stdout
 
 
 @pytest.mark.usefixtures("here")
@@ -231,36 +208,24 @@ def test_two_engines_must_hold_the_model():
 
 MODULES = {
     "gives_3": "def f(): return 3",
-    "divides": "def f(): return 1 / 0",
-    "unfinished": "def f(:",
-    "needs": "import no_such_package",
     "leaves": "import sys; sys.exit(0)",
-    "wants": "def f(x): return x",
     "faulty": "import mbkit\ndef f(): return mbkit.ModelBuilder('empty').build()",
 }
 BAD = [
     (["check"], "give a TARGET"),
-    (["check", ""], "empty"),
     (["check", "pandaa"], "did you mean 'panda'"),
     (["check", "qqqqqqqq"], "mbkit robots"),
     (["check", "nothing.urdf"], "nothing.urdf: no such file"),
-    (["check", "."], "."),
-    (["check", "cut.urdf"], "line 1"),
-    (["check", "bomb.urdf"], "document type"),
-    (["check", "negative.urdf"], "mass"),
     (["check", "nowhere:f"], "No module named 'nowhere'"),
     (["check", "gives_3:g"], "unknown function 'g'"),
     (["check", "gives_3:f"], "expected a Model, got int"),
-    (["check", "needs:f"], "no_such_package"),
     (["check", "leaves:f"], "SystemExit"),
     (["check", "faulty:f"], "no bodies"),
     (["check", "panda", "--engines", "pinocchio,bullet"], "unknown engine 'bullet'"),
     (["check", "panda", "--engines", "pinocchio"], "at least two"),
-    (["check", "panda", "--samples", "0"], "--samples"),
     (["check", "panda", "--mimic", "maybe"], "--mimic"),
     (["check", "panda", "--jobs", "2"], "--all"),
     (["check", "panda", "--out", "regular/below"], "regular is not a folder"),
-    (["check", "--all", "--out", "regular"], "is not a folder"),
     (["check", "--all", "panda"], "without a TARGET"),
     (["chekc", "panda"], "No such command"),
 ]
@@ -272,15 +237,6 @@ def test_bad_input_is_one_message_and_exit_2(here, arguments, told):
         module(here, name, text)
         sys.modules.pop(name, None)
     (here / "regular").write_text("")
-    (here / "empty.urdf").write_text("")
-    (here / "cut.urdf").write_text("<robot name='r'><link")
-    (here / "nameless.urdf").write_text("<robot><link name='a'/></robot>")
-    (here / "bomb.urdf").write_text('<!DOCTYPE r [<!ENTITY a "aaaa">]><robot name="&a;"/>')
-    (here / "negative.urdf").write_text(
-        '<robot name="r"><link name="a"/><link name="b"><inertial><mass value="-1"/>'
-        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
-        '<joint name="j" type="continuous"><parent link="a"/><child link="b"/><axis xyz="1 0 0"/></joint></robot>'
-    )
     result = call(*arguments)
     assert result.exit_code == 2, result.output
     assert told in result.stderr

@@ -16,7 +16,6 @@ from scipy.special import mathieu_a
 
 import mbkit as mb
 from mbkit.lagrangian import Lagrangian, systems
-from mbkit.lagrangian.statics.virtual_work import generalized_force
 from mbkit.lagrangian.system import QuasiLagrangian
 from tests import twins
 from tests.twins import TWINS, paper
@@ -320,20 +319,6 @@ def test_quadrature_is_the_elliptic_functions() -> None:
             quadrature.Swing(swing.inertia, swing.potential, start, speed).at(t)
 
 
-def test_small_motions_are_the_normal_modes() -> None:
-    """Of two equal pendulums, ω² = (2 ∓ √2) g/l with θ₂ = ±√2 θ₁; what is left goes with the amplitude's cube."""
-    dyn = systems.double_pendulum().dynamics(options=INTERPRETED)
-    times = np.linspace(0.0, 2.0, 5)
-    for sign in (1, -1):
-        shape, w = np.array([1.0, sign * np.sqrt(2)]), np.sqrt((2 - sign * np.sqrt(2)) * 9.81)
-        apart = []
-        for size in (0.02, 0.01):
-            out = mb.simulate(dyn, size * shape, np.zeros(2), 2.0, "rk853", rtol=1e-13, save=times)
-            apart.append(np.abs(out.q - np.outer(np.cos(w * times), size * shape)).max())
-        # The next term is of the fifth power: a share of the amplitude's square.
-        assert apart[0] / apart[1] == pytest.approx(8.0, rel=2e-3)
-
-
 def test_upright_is_stable_above_mathieus_threshold() -> None:
     """x'' + (A - 2 Q cos 2τ) x = 0 about the upright, A = -4 g/(l Ω²), Q = 2 a/l: stable where A > a₀(Q).
 
@@ -365,22 +350,3 @@ def test_shaken_pendulum_stands_or_falls(rate: float, stays: bool) -> None:
     aside = np.abs(out.q - np.pi).max()
     # The shaking adds a share a/l to the slow swing.
     assert aside < (np.pi - 3.0) * 1.1 if stays else aside > 1.0
-
-
-def test_an_arm_rests_alike_on_paper_and_in_every_engine() -> None:
-    """Holding torques with a payload are ∂V/∂θ, by virtual work: on paper, of bodies, and written out."""
-    load, q = 1.7, np.array([0.6, 1.1])
-    form = twins.DOUBLE
-    weights = 9.81 * np.array([form["mass1"] + 1.0 + load, 1.0 + load]) * [1.0, form["length2"]] * np.sin(q)
-    lag = paper("double_pendulum")
-    (first, second), down = lag.coordinates, sp.Symbol("W")
-    tip = [sp.sin(first) + form["length2"] * sp.sin(second), -sp.cos(first) - form["length2"] * sp.cos(second)]
-    loaded = Lagrangian(
-        lag.T, lag.V, lag.coordinates, lag.velocities, forces=generalized_force([[0, -down]], [tip], lag.coordinates),
-        parameters={**lag.parameters, down: 9.81 * load},
-    )  # fmt: skip
-    assert mb.equilibrium(loaded, holding=q).tau == pytest.approx(weights, rel=1e-14)
-    for engine in ENGINES:
-        dyn = mb.dynamics(TWINS["double_pendulum"].model(), engine)
-        held = mb.equilibrium(dyn, holding=RELATIVE @ q, forces={"tip": np.array([0.0, 0.0, -9.81 * load])})
-        assert held.tau @ RELATIVE == pytest.approx(weights, rel=1e-14)

@@ -25,7 +25,7 @@ from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.pinocchio.engine import PinocchioDynamics
 from mbkit.engines.registry import find_engine
-from mbkit.errors import InputError, NumericalError, UnknownNameError
+from mbkit.errors import InputError, NumericalError
 from mbkit.studies.compare import beyond_terms
 from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
 from mbkit.studies.compare.beyond_terms import findings, rollouts
@@ -48,8 +48,9 @@ from tests.scenes import chain, hinge
 TERM_NAMES = {t.name for t in (*TERMS, *BODY_TERMS)} | {"power balance"}
 #: Terms that MuJoCo does not have.
 WITHOUT_MUJOCO = ("regressor", "∂ID/∂(q, v, a)")
-SOUND_IN_BOTH = ("revolute", "continuous", "prismatic", "ball", "planar", "free", "fixed")
 HINGE = {"axis": (0, 1, 0)}
+ROD = {"mass": 1.0, "com": (0.1, 0.2, -0.3), "inertia": (0.2, 0.3, 0.25), "translation": (0, 0, -0.5)}
+SMALL = chain(*(ROD | {"axis": x} for x in np.eye(3)), name="small").build()
 
 
 @pytest.fixture(autouse=True)
@@ -75,10 +76,10 @@ def terms(model, **kwargs):
     return mb.compare(model, samples=16, terms_only=True, **kwargs)
 
 
-@pytest.mark.thorough("human", "tiago_no_hand", "solo12")
-@pytest.mark.parametrize("robot", ["double_pendulum", "human", "tiago_no_hand", "solo12"])
+@pytest.mark.thorough("human", "tiago_no_hand")
+@pytest.mark.parametrize("robot", ["double_pendulum", "human", "tiago_no_hand"])
 def test_robots_agree(robot):
-    result = terms(mb.load(robot, floating_base=robot == "solo12"))
+    result = terms(mb.load(robot))
     assert result.passed, result.verdict
     assert result.engines == ("pinocchio", "lagrangian", "mujoco")
     assert {r.term for r in result.rows} == TERM_NAMES
@@ -92,33 +93,14 @@ def test_robots_agree(robot):
         assert row.samples > 16
 
 
-@pytest.mark.thorough("1")
-@pytest.mark.parametrize("seed", range(2))
-def test_random_trees_agree_with_everything_that_acts(seed):
-    model = random_tree(seed, len(SOUND_IN_BOTH), SOUND_IN_BOTH)
-    # Armature off the positive axes is a known defect, tested by itself.
-    result = terms(model.without("armature"))
-    assert result.passed, result.verdict
-    assert result.facts["needs"]["springs"]
-    assert result.facts["needs"]["damping"]
-
-
-@pytest.mark.thorough("MujocoDynamics-_nle-nle", "LagrangianDynamics-_forward_dynamics-forward dynamics")
 @pytest.mark.usefixtures("of_motion")
-@pytest.mark.parametrize(
-    ("engine", "method", "term"),
-    [
-        (MujocoDynamics, "_nle", "nle"),
-        (MujocoDynamics, "_forward_dynamics", "forward dynamics"),
-        (LagrangianDynamics, "_forward_dynamics", "forward dynamics"),
-    ],
-)
-def test_an_engine_that_gives_nan_fails(monkeypatch, engine, method, term):
-    planted(monkeypatch, engine, method, lambda x: np.full_like(x, np.nan))
-    result = terms(mb.load("ur5"))
+def test_an_engine_that_gives_nan_fails(monkeypatch):
+    term = "forward dynamics"
+    planted(monkeypatch, MujocoDynamics, "_forward_dynamics", lambda x: np.full_like(x, np.nan))
+    result = terms(SMALL)
     assert not result.passed
     broken = [r for r in result.rows if not r.passed and r.term == term]
-    assert [r.engine for r in broken] == [engine.engine]
+    assert [r.engine for r in broken] == ["mujoco"]
     assert "not finite" in broken[0].reason
     # The others are still compared with each other.
     assert sum(r.term == term and r.passed for r in result.rows) == 2
@@ -180,7 +162,7 @@ def test_a_sweep_in_which_every_robot_is_refused_is_no_agreement():
 @pytest.mark.usefixtures("of_motion")
 def test_every_engine_is_measured_by_the_oracle(monkeypatch):
     """An error that all engines share is seen."""
-    model = mb.load("ur5")
+    model = SMALL
     result = terms(model)
     assert result.reference == "oracle"
     assert {r.reference for r in result.rows} == {"oracle"}
@@ -197,7 +179,7 @@ def test_where_the_oracle_has_no_value_an_engine_stands_in(monkeypatch):
         raise NumericalError("no value here")
 
     monkeypatch.setattr(OracleDynamics, "_passive", fail)
-    result = terms(mb.load("ur5").without("gravity"))
+    result = terms(SMALL.without("gravity"))
     assert any(r.engine == "oracle" and r.term == "passive" for r in result.refusals)
     rows = [r for r in result.rows if r.term == "passive"]
     assert {r.reference for r in rows} == {"pinocchio"}
@@ -239,18 +221,11 @@ def planted(monkeypatch, engine, method, change):
     monkeypatch.setattr(engine, method, lambda self, *a: change(original(self, *a)))
 
 
-@pytest.mark.thorough("_gravity-1e-11", "_nle-1.0", "_inverse_dynamics-1e-11", "_passive-1e-11")
 @pytest.mark.usefixtures("of_motion")
-@pytest.mark.parametrize(
-    ("method", "size"),
-    [("_gravity", 1e-11), ("_nle", 1e-11), ("_nle", 1.0), ("_inverse_dynamics", 1e-11), ("_passive", 1e-11)],
-)
-def test_a_planted_error_in_one_joint_is_found_and_named(monkeypatch, method, size):
-    model, k = mb.load("ur5"), 2
-    (term,) = (t.name for t in TERMS if f"_{t.quantity}" == method)
-
+def test_a_planted_error_in_one_joint_is_found_and_named(monkeypatch):
+    model, k, term = SMALL, 1, "nle"
     # Relative to the whole vector, on one joint.
-    planted(monkeypatch, MujocoDynamics, method, lambda x: x + 100 * size * (1 + np.abs(x).max()) * np.eye(6)[k])
+    planted(monkeypatch, MujocoDynamics, "_nle", lambda x: x + 1e-9 * (1 + np.abs(x).max()) * np.eye(3)[k])
     result = terms(model)
     failed = {(r.term, r.engine): r for r in result.rows if not r.passed}
     assert (term, "mujoco") in failed
@@ -262,14 +237,13 @@ def test_a_planted_error_in_one_joint_is_found_and_named(monkeypatch, method, si
     assert not result.worst.passed
 
 
-@pytest.mark.thorough("_regressor-regressor-entry0")
 @pytest.mark.parametrize(
     ("method", "term", "entry"),
-    [("_regressor", WITHOUT_MUJOCO[0], (2, 35))]
-    + [("_inverse_dynamics_derivatives", WITHOUT_MUJOCO[1], (k, 2, 4)) for k in range(3)],
+    [("_regressor", WITHOUT_MUJOCO[0], (1, 25))]
+    + [("_inverse_dynamics_derivatives", WITHOUT_MUJOCO[1], (k, 1, 2)) for k in range(3)],
 )
 def test_one_wrong_entry_of_a_derivative_is_found_at_its_joint(monkeypatch, method, term, entry):
-    model = mb.load("ur5")
+    model = SMALL
 
     def spoil(x):
         x = np.array(x)
@@ -280,7 +254,7 @@ def test_one_wrong_entry_of_a_derivative_is_found_at_its_joint(monkeypatch, meth
     (failed,) = (r for r in terms(model, engines=("pinocchio", "lagrangian")).rows if not r.passed)
     assert (failed.term, failed.engine) == (term, "pinocchio")
     # Of the two that an entry of derivatives belongs to, the first is that of the force.
-    assert failed.joint == model.joint_names[2]
+    assert failed.joint == model.joint_names[1]
 
 
 @pytest.mark.usefixtures("of_motion")
@@ -290,7 +264,7 @@ def test_one_wrong_entry_of_a_derivative_is_found_at_its_joint(monkeypatch, meth
 def test_the_rounding_of_the_mass_matrix_excuses_no_other_term(monkeypatch, method, term, passed):
     planted(monkeypatch, MujocoDynamics, method, lambda x: x * (1 + 1e-9))
     monkeypatch.setattr(MujocoDynamics, "_mass_matrix_rounding", lambda self, q, quantity: 1e10)  # noqa: ARG005
-    rows = {(r.term, r.engine): r for r in terms(mb.load("ur5"), engines=("pinocchio", "mujoco")).rows}
+    rows = {(r.term, r.engine): r for r in terms(SMALL, engines=("pinocchio", "mujoco")).rows}
     row = rows[term, "mujoco"]
     assert row.passed == passed
     assert (row.allowed > 1e-12) == passed
@@ -298,7 +272,7 @@ def test_the_rounding_of_the_mass_matrix_excuses_no_other_term(monkeypatch, meth
 
 def test_a_planted_error_in_the_accelerations_breaks_the_power_balance(monkeypatch):
     planted(monkeypatch, PinocchioDynamics, "forward_dynamics", lambda a: a * (1 + 1e-8))
-    failed = {(r.term, r.engine) for r in terms(mb.load("ur5")).rows if not r.passed}
+    failed = {(r.term, r.engine) for r in terms(SMALL).rows if not r.passed}
     assert failed == {(term, "pinocchio") for term in ("forward dynamics", "forward dynamics, wrench", "power balance")}
 
 
@@ -492,7 +466,7 @@ def test_one_engine_alone_agrees_with_the_reference():
 
 @pytest.mark.usefixtures("of_motion")
 def test_the_same_seed_gives_the_same_numbers_and_progress_grows():
-    model, told = mb.load("ur5"), []
+    model, told = SMALL, []
     first, again, other = (terms(model, seed=s, progress=lambda *x: told.append(x)) for s in (1, 1, 2))
 
     def numbers(r):
@@ -510,11 +484,7 @@ def test_the_same_seed_gives_the_same_numbers_and_progress_grows():
     ("kwargs", "error", "message"),
     [
         ({"engines": ("pinocchio",)}, InputError, "at least 2"),
-        ({"engines": "pinocchio"}, InputError, "several names"),
         ({"engines": ("pinocchio", "oracle")}, InputError, "leave it out"),
-        ({"engines": ("pinocchio", "mujocco")}, UnknownNameError, "'mujoco'"),
-        ({"samples": 0}, InputError, "samples"),
-        ({"tolerance": -1.0}, InputError, "tolerance"),
         ({"model": hinge("rock", kind="fixed", axis=None).build()}, InputError, "nothing moves in rock"),
     ],
 )
@@ -564,16 +534,7 @@ def test_a_vanishing_term_is_measured_by_the_forces_at_play():
     assert force_errors(e, none, heavy).relative == pytest.approx([1e-15 / 25])
 
 
-@pytest.mark.thorough("pendulum", "cart_pole", "double_pendulum", "chain")
-@pytest.mark.parametrize("system", ["pendulum", "cart_pole", "double_pendulum", "heavy_top", "free_body", "chain"])
-def test_small_systems_agree_at_very_many_states(system):
-    """A lone joint meets every cancellation there is: at rest, straight down, at zero energy."""
-    model = mb.catalog.get(system)()
-    result = mb.compare(model, samples=600 // model.nv, terms_only=True)
-    assert result.passed, result.verdict
-
-
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(1))
 def test_gravity_exerts_no_more_than_its_scale(seed):
     model = random_tree(seed, 8, springs=False, damping=False, armature=False)
     dyn = mb.dynamics(model, "lagrangian")

@@ -100,19 +100,6 @@ def test_equations_show_multipliers_and_the_constraint(rod):
     assert sp.simplify(second.subs(plain).subs(named) - driven.constraint_acceleration[0]) == 0
 
 
-def test_derivatives_are_those_of_the_constrained_acceleration(rod):
-    q, v = on_circle(0.7, -1.1)
-    dyn, tau, h = rod.dynamics(options=OWN), np.array([0.3, -0.2]), 1e-6
-    told = dyn.forward_dynamics_derivatives(q, v, tau)
-    for k, name in enumerate(("q", "v", "tau")):
-        for i, e in enumerate(h * np.eye(2)):
-            there, back = ([q, v, tau], [q, v, tau])
-            there[k], back = there[k] + e, [*back]
-            back[k] = [q, v, tau][k] - e
-            change = (dyn.forward_dynamics(*there) - dyn.forward_dynamics(*back)) / (2 * h)
-            assert np.abs(getattr(told, name)[:, i] - change).max() < 1e-8
-
-
 # Drift
 
 
@@ -138,14 +125,6 @@ def test_every_method_stays_on_the_constraints(rod, method):
         "bdf": 1e-5,
         "lsoda": 1e-5,
     }.get(method, 1e-6)
-
-
-@pytest.mark.thorough
-def test_thousands_of_steps_of_the_coarsest_method_stay_on_the_constraints(rod):
-    q, v = on_circle(1.0, 0.3)
-    run = mb.simulate(rod.dynamics(options=OWN), q, v, 4.0, "semi_implicit_euler", dt=1e-3, save=1000)
-    assert run.stats.steps == 4000
-    assert max(drift(rod, run)) < DRIFT
 
 
 def test_projection_leaves_the_order_of_a_method(rod):
@@ -323,18 +302,6 @@ def test_embedded_is_the_same_motion_and_the_closed_form(rod):
     chosen = [hit.name for hit in own.events]
     assert chosen == ["independent: x", "independent: y", "independent: x"]
     assert np.ptp(own.energy()) < 1e-10
-
-
-@pytest.mark.thorough
-def test_embedded_with_fixed_steps(rod):
-    q, v = on_circle(0.1, 8.0 / 1.5)
-    fine = mb.simulate(rod.dynamics(options=OWN), q, v, 0.5, "rk853", rtol=1e-13, save=[0.5])
-    for method, close in (("rk4", 1e-4), ("gauss6", 1e-7)):
-        run = mb.simulate(rod.embedded(), q, v, 0.5, method, dt=0.005, save=10)
-        assert np.allclose(run.t, np.linspace(0, 0.5, 11))
-        assert np.abs(run.q[-1] - fine.q[-1]).max() < close
-        assert len(run.events) > 1
-        assert max(drift(rod, run)) < DRIFT
 
 
 def test_embedded_takes_torques_and_events_on_all_coordinates(rod):
@@ -679,24 +646,6 @@ def test_bead_on_a_driven_hoop_by_multipliers_and_embedded():
     with pytest.raises(InputError, match="v0"):
         mb.simulate(lag.dynamics(options=OWN), q, np.zeros(3), 1.0, "rk853")
     assert np.abs(lag.project(q, np.zeros(3))[1] - v).max() < 1e-13
-
-
-def test_pendulum_with_a_driven_pivot_by_multipliers_and_embedded():
-    numbers = {**NUMBERS, a: 0.2, Om: 6.0}
-    lag = pendulum(
-        constraints=[(x**2 + (y - a * sp.sin(Om * t)) ** 2 - ell**2) / 2], time=t, parameters=numbers, name="driven"
-    )
-    X, Y = ell * sp.sin(th), a * sp.sin(Om * t) - ell * sp.cos(th)
-    T = m * ((X.diff(th) * w) ** 2 + (Y.diff(th) * w + Y.diff(t)) ** 2) / 2
-    one = Lagrangian(T, m * g * Y, [th], [w], time=t, parameters=numbers)
-    q, v = lag.project([1.5 * np.sin(0.5), -1.5 * np.cos(0.5)], [0.0, 1.2])
-    rate = (v - [0.0, 1.2]) @ [np.cos(0.5), np.sin(0.5)] / 1.5
-    save = [0.0, 0.7, 1.0]
-    angle = mb.simulate(one.dynamics(options=OWN), [0.5], [rate], 1.0, "dop853", rtol=1e-13, save=save).q[:, 0]
-    for dyn, method in ((lag.dynamics(options=OWN), "dop853"), (lag.embedded(), "rk853")):
-        run = mb.simulate(dyn, q, v, 1.0, method, rtol=1e-12, save=save)
-        assert np.abs(run.q[:, 0] - 1.5 * np.sin(angle)).max() < 1e-9
-        assert drift(lag, run)[0] < DRIFT
 
 
 @pytest.mark.thorough("dynamics-gauss4", "embedded-rk4", "embedded-rk853")

@@ -16,6 +16,7 @@ from mbkit.engines.mujoco.mjcf_writer import mjcf_text, read_back
 from mbkit.errors import InputError, MbkitError, OutputError, UnknownNameError, UnsupportedError
 from mbkit.load import xml_reader
 from tests.random_trees import IN_MUJOCO, random_tree
+from tests.scenes import mounted
 
 
 @pytest.mark.parametrize("name", [0, 1, 2, "tiago_no_hand", "talos"])
@@ -136,14 +137,17 @@ def test_the_door(tmp_path: Path) -> None:
     assert same.exit_code == 0, same.output
 
 
+@pytest.mark.parametrize(
+    ("character", "where"),
+    [(x, ("model", "body", "joint")[k % 3]) for k, x in enumerate('\x00\x0b\x1b\uffff\n\t<&"é\x85')],
+)
 @pytest.mark.parametrize("to", ["mjcf", "urdf"])
-@pytest.mark.parametrize("where", ["model", "body", "joint"])
-@pytest.mark.parametrize("character", ["\x00", "\x0b", "\x1b", "\uffff", "\n", "\t", "<", "&", '"', "é", "\x85"])
 def test_a_name_is_written_so_that_xml_reads_it_or_refused(character: str, where: str, to: str) -> None:
     names = {n: f"a{character * (n == where)}b" for n in ("model", "body", "joint")}
-    b = mb.ModelBuilder(names["model"])
-    b.add_body(names["body"], mass=1.0, com=(0, 0, 1), inertia=(1, 1, 1))
-    b.add_joint(names["joint"], "continuous", parent="world", child=names["body"], axis=(0, 1, 0))
+    place = {"axis": (0, 1, 0)}
+    b = mounted(
+        names["model"], names["body"], names["joint"], "continuous", mass=1.0, com=(0, 0, 1), inertia=(1, 1, 1), **place
+    )
     model = b.build()
     if character.isprintable() or character in "\n\t\x85":
         root = xml_reader.parse(mb.convert(model, to).text.encode(), "text")

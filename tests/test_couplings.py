@@ -130,7 +130,7 @@ def mujoco_terms(text: str, q: Any, v: Any) -> tuple[Any, Any, Any]:
     return M, d.qfrc_passive + d.qfrc_actuator, np.array(d.qacc)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_random_tendons_and_actuators_are_what_mujoco_makes_of_them(seed, tmp_path):
     text = random_transmissions(seed)
     (tmp_path / "robot.xml").write_text(text)
@@ -158,7 +158,7 @@ PLAIN = (
 )
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_by_default_the_servos_of_a_file_do_not_act(seed, tmp_path):
     """As in MuJoCo where the flag of actuation is off: rotors and the damping of transmissions are left."""
     text = random_transmissions(seed).replace(' actuation="disable"', "")
@@ -281,15 +281,13 @@ def assert_near(actual: Any, expected: Any, factor: float = 1e4) -> None:
     ("engine", "kinds", "deep", "mimic"),
     [
         ("lagrangian", ALL, False, True),
-        ("lagrangian", ALL, False, False),
-        ("pinocchio", SOUND, False, True),
         ("pinocchio", SOUND, False, False),
         # MuJoCo has rotors within a branch only.
         ("mujoco", ("revolute", "prismatic", "planar", "continuous"), True, False),
         ("oracle", ("revolute", "helical", "ball"), False, False),
     ],
 )
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", range(1))
 def test_terms_are_those_of_the_definition(engine, kinds, deep, mimic, seed):
     model, plain = coupled_tree(seed, kinds, deep=deep, mimic=mimic)
     options = {"compile": False} if engine == "lagrangian" else {}

@@ -79,20 +79,6 @@ def test_every_quantity_has_the_bits_of_the_cpu(name: str) -> None:
             assert all(np.array_equal(a, b) for a, b in zip(found, want, strict=True)), (quantity, layout)
 
 
-def test_frames_and_derivatives_have_the_bits_of_the_cpu() -> None:
-    model = random_tree(22, 3, ("revolute",))
-    cpu, gpu = both(model)
-    q, v, a = study.states(model, 9).values()
-    for call in (
-        lambda d, *x: d.jacobian(x[0], "tip"),
-        lambda d, *x: d.frame_pose(x[0], "tip") if hasattr(d, "frame_pose") else d.gravity(x[0]),
-        lambda d, *x: d.forward_dynamics_derivatives(*x).tau,
-    ):
-        want = np.asarray(call(cpu, q, v, a))
-        assert np.array_equal(call(gpu, q, v, a), want)
-        assert np.array_equal(np.asarray(call(gpu, *(on_gpu(x, major=True) for x in (q, v, a)))), want)
-
-
 def test_one_state_runs_on_the_cpu(fake: FakeDriver) -> None:  # noqa: F811
     model = mb.load("ur5")
     cpu, dyn = both(model)
@@ -141,20 +127,10 @@ TORQUES = {
 }
 
 
-@pytest.mark.thorough(
-    "a floating tree-semi_implicit_euler-feedback",
-    "panda-rk4-feedback",
-    "panda-rk4-each step's of each run",
-    "a floating tree-semi_implicit_euler-none",
-    "a floating tree-semi_implicit_euler-each step's",
-    "a floating tree-semi_implicit_euler-each step's of each run",
-)
+@pytest.mark.thorough("panda-rk4-each step's of each run")
 @pytest.mark.parametrize(
     ("name", "method", "torque"),
-    [
-        *(("a floating tree", "semi_implicit_euler", torque) for torque in TORQUES),
-        *(("panda", "rk4", torque) for torque in ("feedback", "each step's of each run")),
-    ],
+    [("a floating tree", "semi_implicit_euler", "constant"), ("panda", "rk4", "each step's of each run")],
 )
 def test_runs_have_the_bits_of_the_cpu(name: str, method: str, torque: str, monkeypatch: pytest.MonkeyPatch) -> None:
     model, n, steps = MODELS[name](), 7, 21
@@ -216,17 +192,6 @@ def test_each_sample_may_have_parameters_of_its_own(monkeypatch: pytest.MonkeyPa
     want = mb.simulate(cpu, q, v, **run)
     without_reruns(monkeypatch)
     assert np.array_equal(mb.simulate(gpu, q, v, **run).q, want.q)
-
-
-@pytest.mark.thorough
-def test_a_run_that_diverges_ends_as_on_the_cpu() -> None:
-    model = random_tree(5, 3, ("free", "revolute", "ball"))
-    q, v, _ = study.states(model, 4).values()
-    v[2] *= 1e4
-    ends = [mb.simulate(d, q, v, 1.0, "rk4", dt=0.05, save=20, doubt=False) for d in both(model)]
-    assert ends[0].stats.message == ends[1].stats.message != ""
-    assert np.array_equal(ends[0].q, ends[1].q, equal_nan=True)
-    assert ends[0].stats.reached == ends[1].stats.reached
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -388,21 +353,6 @@ def test_machine_code_is_kept_on_disk(fake: FakeDriver, monkeypatch: pytest.Monk
         equations_of(model).kept.pop("device", None)
 
 
-@pytest.mark.thorough
-def test_machine_code_is_dropped_with_what_it_is_of(fake: FakeDriver) -> None:  # noqa: F811
-    model = random_tree(18, 2, ("revolute",))
-    _, dyn = both(model)
-    q, v, a = study.states(model, 3).values()
-    dyn.forward_dynamics(q, v, a)
-    # Those of other tests.
-    gc.collect()
-    fake.unloaded.clear()
-    equations_of(model).kept.clear()
-    del dyn
-    gc.collect()
-    assert len(fake.unloaded) == 1
-
-
 def test_pickled_dynamics_come_back_on_the_gpu() -> None:
     model = mb.load("ur5")
     _, gpu = both(model)
@@ -412,7 +362,7 @@ def test_pickled_dynamics_come_back_on_the_gpu() -> None:
     assert np.array_equal(again.forward_dynamics(q, v, a), gpu.forward_dynamics(q, v, a))
 
 
-@pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:x", "", 3])
+@pytest.mark.parametrize("name", ["gpu", "cuda:x", 3])
 def test_other_devices_are_unknown(name: Any) -> None:
     with pytest.raises(UnknownNameError, match="device"):
         mb.dynamics(mb.load("ur5"), "lagrangian", device=name)

@@ -17,15 +17,16 @@ from mbkit.errors import KnownDefectWarning
 from mbkit.model.joint_types import KINDS
 from mbkit.report.page import render
 from tests.random_trees import off, states
+from tests.scenes import mounted
 
 PINOCCHIO = version("pin")
 in_this_version = pytest.mark.skipif(PINOCCHIO != "4.1.0", reason="reproduced in Pinocchio 4.1.0 only")
 
 
 def one_joint(kind, armature=0.0, **axes):
-    b = mb.ModelBuilder(kind)
-    b.add_body("a", mass=1.3, com=(0.1, 0.2, -0.4), inertia=(0.3, 0.4, 0.5))
-    b.add_joint("odd", kind, parent="world", child="a", armature=armature, **axes)
+    b = mounted(
+        kind, "a", "odd", kind, mass=1.3, com=(0.1, 0.2, -0.4), inertia=(0.3, 0.4, 0.5), armature=armature, **axes
+    )
     b.add_body("b", mass=0.7, com=(0.3, 0, 0.1), inertia=(0.2, 0.2, 0.3))
     b.add_joint("plain", "revolute", parent="a", child="b", axis=(1, 0, 0), translation=(0, 0, -1))
     return b.build()
@@ -63,18 +64,6 @@ def test_pinocchios_rates_of_jacobians_are_returned_with_a_warning_that_names_th
         assert off(wrong, getattr(own, quantity)(q, v, *more)) > 1e-3
     right = dyn.acceleration(q, v, np.zeros(model.nv), "a")
     assert off(right, own.jacobian_dot_v(q, v, "a")) < 1e-14
-
-
-@in_this_version
-def test_pinocchios_centroidal_map_variation_reads_the_velocity_of_an_earlier_call():
-    """It is why mbkit calls `dccrba`."""
-    pin = pytest.importorskip("pinocchio")
-    model = mb.dynamics(one_joint("revolute", axis=(0, 1, 0))).pin_model
-    data, q, v = model.createData(), np.array([0.3, 0.4]), np.array([1.0, -2.0])
-    right = pin.dccrba(model, data, q, v).copy()
-    pin.centerOfMass(model, data, q, np.array([3.0, 1.0]))
-    assert off(pin.computeCentroidalMapTimeVariation(model, data, q, v), right) > 1e-2
-    assert off(pin.dccrba(model, data, q, v), right) == 0.0
 
 
 @in_this_version

@@ -20,6 +20,8 @@ from mbkit.lagrangian.summary import SystemSummary, python_code
 from mbkit.model import Model
 from mbkit.model.changes.jumps import held_at_rest
 from tests.random_trees import IN_MUJOCO, SOUND, off, random_tree, states
+from tests.scenes import mounted
+from tests.test_friction_beside_rows import BARS, four_bar
 
 EPS = float(np.finfo(float).eps)
 ENGINES = ("lagrangian", "pinocchio", "mujoco", "drake")
@@ -129,22 +131,12 @@ def test_equations_on_paper_programs_and_c_hold_the_friction_of_motion_and_tell_
     assert "rest" not in str(mb.lagrangian.program(model, "mass_matrix"))
 
 
-@pytest.mark.parametrize("seed", [0])
-def test_on_paper_friction_at_speed_is_that_of_the_engine(seed: int) -> None:
-    model = rubbed(seed, 3, ("revolute", "prismatic", "continuous"), mimic=True)
-    q, v, _, tau = states(model, 3)
-    with pytest.warns(MbkitWarning, match="zero at rest"):
-        paper = mb.lagrangian.from_model(model).dynamics(options={"compile": False})
-    expected = mb.dynamics(model, "lagrangian", compile=False).forward_dynamics(q, v, tau)
-    assert off(paper.forward_dynamics(q, v, tau), expected) < 1e4 * EPS
-
-
 # At rest
 
 
-@pytest.mark.thorough("0-lagrangian", "0-drake", "1-lagrangian", "2-lagrangian")
+@pytest.mark.thorough("0-lagrangian", "0-drake", "1-lagrangian")
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_at_rest_friction_is_what_the_least_constraint_needs(engine: str, seed: int) -> None:
     model = rubbed(seed, curve=False, mimic=seed % 2 == 0)
     q, v, tau = mostly_at_rest(model, 12, seed)
@@ -161,8 +153,7 @@ def test_at_rest_friction_is_what_the_least_constraint_needs(engine: str, seed: 
     assert (rest & (a == 0)).any()
 
 
-@pytest.mark.thorough("0", "1", "3")
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [2])
 def test_at_rest_accelerations_are_the_best_of_all_patterns(seed: int) -> None:
     model = rubbed(seed, 4, ("revolute", "prismatic", "universal"), curve=False)
     q, v, tau = mostly_at_rest(model, 4, seed)
@@ -186,22 +177,6 @@ def test_at_rest_accelerations_are_the_best_of_all_patterns(seed: int) -> None:
             if cost(a) < value:
                 best, value = a, cost(a)
         assert off(got[i], best) < 1e-11
-
-
-@pytest.mark.thorough("5-kinds1", "2-kinds2")
-@pytest.mark.parametrize(("seed", "kinds"), [(0, IN_MUJOCO), (5, IN_MUJOCO), (2, ("revolute", "prismatic", "helical"))])
-def test_engines_agree_with_the_oracle_at_rest(seed: int, kinds: tuple[str, ...]) -> None:
-    model = rubbed(seed, 6, kinds, mimic=True, springs="helical" not in kinds)
-    q, v, tau = mostly_at_rest(model, 5, seed)
-    exact = np.asarray(mb.dynamics(model, "oracle").forward_dynamics(q, v, tau), dtype=float)
-    M = mb.dynamics(model, "lagrangian").mass_matrix(q)
-    tolerance = 1e3 * EPS * np.linalg.cond(M).max()
-    for engine in ENGINES:
-        if engine == "mujoco" and "helical" in kinds:
-            continue
-        a = mb.dynamics(model, engine).forward_dynamics(q, v, tau)
-        assert off(a, exact) < tolerance, engine
-        assert ((a == 0) == (exact == 0)).all(), engine
 
 
 @settings(max_examples=150)
@@ -248,8 +223,7 @@ def test_a_follower_rubs_at_its_own_rate() -> None:
 
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
 def test_a_four_bar_at_rest_yields_to_what_friction_cannot_hold(engine: str) -> None:
-    friction = np.array([0.5, 1.0, 2.0])
-    model = four_bar(friction)
+    model, friction = four_bar(), BARS
     dyn, bare = mb.dynamics(model, engine), mb.dynamics(model.without("friction"), "lagrangian")
     q, _ = bare.project([1.2, -0.6, 1.5], np.zeros(3))
     # The one direction in which it can move: everything else follows from its inertia and what pulls along it.
@@ -263,26 +237,14 @@ def test_a_four_bar_at_rest_yields_to_what_friction_cannot_hold(engine: str) -> 
         assert off(dyn.forward_dynamics(q, still, tau), rate * n) < 1e-9
 
 
-def four_bar(friction: np.ndarray) -> Model:
-    b = mb.ModelBuilder("four_bar", gravity=(0, -9.81, 0))
-    rods = (("crank", "world", 0.0, 0.3), ("coupler", "crank", 0.3, 0.9), ("rocker", "world", 1.0, 0.7))
-    for (name, parent, x, length), f in zip(rods, friction, strict=True):
-        b.add_body(name, mass=2 * length, com=(length / 2, 0, 0), inertia=2 * length**3 / 12 * np.ones(3))
-        place = {"axis": (0, 0, 1), "translation": (x, 0, 0)}
-        b.add_joint(name, "continuous", parent=parent, child=name, friction=f, **place)
-    ends = {"translation_a": (0.9, 0, 0), "translation_b": (0.7, 0, 0)}
-    b.add_loop("pin", "point", body_a="coupler", body_b="rocker", **ends)
-    return b.build()
-
-
 # Runs
 
 
 def slider(**friction: float) -> Model:
     """Return 2 kg on a spring of 50 N/m."""
-    b = mb.ModelBuilder("slider", gravity=np.zeros(3))
-    b.add_body("block", mass=2.0)
-    b.add_joint("x", "prismatic", parent="world", child="block", axis=(1, 0, 0), stiffness=50.0, **friction)
+    b = mounted(
+        "slider", "block", "x", "prismatic", gravity=np.zeros(3), mass=2.0, axis=(1, 0, 0), stiffness=50.0, **friction
+    )
     return b.build()
 
 
@@ -314,42 +276,6 @@ def test_what_rests_stays_where_it_is_to_the_last_bit(method: str) -> None:
     assert moved.q[-1, 0] < 0.061
 
 
-@pytest.mark.thorough("pinocchio", "mujoco", "drake")
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_step_is_a_run_of_one_step(engine: str) -> None:
-    # Drake has no rotor for joints of several velocities.
-    several = ("universal", "spherical_zyx") if engine != "drake" else ("revolute", "prismatic")
-    model = rubbed(2, 4, ("revolute", "prismatic", *several))
-    q, v, tau = mostly_at_rest(model, 5)
-    v *= 0.05
-    dyn = mb.dynamics(model, engine)
-    for method in ("rk4", "semi_implicit_euler"):
-        together = dyn.step(q, v, tau, 1e-2, method)
-        for i in range(len(q)):
-            run = mb.simulate(dyn, q[i], v[i], 1e-2, method, dt=1e-2, torque=tau[i])
-            for ours, own, theirs in zip(
-                together, dyn.step(q[i], v[i], tau[i], 1e-2, method), (run.q, run.v), strict=True
-            ):
-                assert off(ours[i], theirs[-1]) < 1e3 * EPS
-                assert off(own, theirs[-1]) < 1e3 * EPS
-
-
-def test_a_run_loses_energy_and_all_methods_and_engines_find_the_same_way() -> None:
-    model = rubbed(7, 3, ("revolute", "universal", "prismatic"), damping=False)
-    q, v = model.random_state(np.random.default_rng(3), 1)
-    save = np.linspace(0, 0.6, 13)
-    first = mb.simulate(mb.dynamics(model, "lagrangian"), q[0], v[0], 0.6, "rk853", rtol=1e-12, save=save)
-    other = mb.simulate(mb.dynamics(model, "pinocchio"), q[0], v[0], 0.6, "auto", rtol=1e-12, save=save)
-    fixed = mb.simulate(mb.dynamics(model, "lagrangian"), q[0], v[0], 0.6, "rk4", dt=2e-3)
-    assert first.events
-    assert [e.name for e in first.events] == [e.name for e in other.events] == [e.name for e in fixed.events]
-    assert off(other.q, first.q) < 1e-9
-    assert off(fixed.q[::25], first.q) < 1e-7
-    dyn = mb.dynamics(model, "lagrangian")
-    energy = dyn.kinetic_energy(first.q, first.v) + dyn.potential_energy(first.q)
-    assert (np.diff(energy) < 1e-12 * np.abs(energy).max()).all()
-
-
 def test_a_block_slides_down_a_slope_up_to_where_it_rests() -> None:
     """3 kg thrown up a slope of 30°, μ = 0.7 and so at rest at its height: v²/2 (sin + μ cos) g; or down with 0.3."""
     for mu, rests in ((0.7, True), (0.3, False)):
@@ -369,9 +295,9 @@ def test_a_block_slides_down_a_slope_up_to_where_it_rests() -> None:
 
 def belt(speed: float) -> Model:
     """Return 2 kg on a spring of 50 N/m to the ground, seen from a belt that moves: 3 N of friction, 5 N at rest."""
-    b = mb.ModelBuilder("belt", gravity=np.zeros(3))
-    b.add_body("block", mass=2.0)
-    b.add_joint("x", "prismatic", parent="world", child="block", axis=(1, 0, 0), friction=3.0, stiction=5.0)
+    b = mounted(
+        "belt", "block", "x", "prismatic", gravity=np.zeros(3), mass=2.0, axis=(1, 0, 0), friction=3.0, stiction=5.0
+    )
     b.add_joint_force("spring", "x", lambda t, q, v: -50.0 * (q + speed * t))  # noqa: ARG005
     return b.build()
 
@@ -386,13 +312,13 @@ def test_a_block_on_a_belt_sticks_and_slips_with_the_period_of_the_closed_form(m
     stick = 2 * (s - f) / (k * speed)
     start = (2 * f - s) / k
     run = mb.simulate(
-        mb.dynamics(belt(speed), "lagrangian"), [start], [0.0], 4 * (slip + stick) + 0.1, method, rtol=1e-13
+        mb.dynamics(belt(speed), "lagrangian"), [start], [0.0], 2 * (slip + stick) + 0.1, method, rtol=1e-13
     )
-    exact = np.array([(n + 1) * stick + n * slip + late * slip for n in range(4) for late in (0, 1)])
-    assert [e.name for e in run.events] == ["x lets go", "x stops"] * 4
+    exact = np.array([(n + 1) * stick + n * slip + late * slip for n in range(2) for late in (0, 1)])
+    assert [e.name for e in run.events] == ["x lets go", "x stops"] * 2
     assert [e.t for e in run.events] == pytest.approx(exact.tolist(), rel=1e-11)
     places = [e.q[0] + speed * e.t for e in run.events]
-    assert places == pytest.approx([s / k, start] * 4, abs=1e-12)
+    assert places == pytest.approx([s / k, start] * 2, abs=1e-12)
 
 
 @pytest.mark.thorough("True-auto", "True-dop853", "False-rk853", "False-dop853", "False-auto")
@@ -412,9 +338,7 @@ def test_a_force_that_hardly_passes_the_bound_is_not_stepped_over(method: str) -
 def windows(pull: float, omega: float, method: str, clock: bool) -> None:
     """What rests takes steps of any length: a force over the bound and below again within one moved nothing."""
     f = 3.0
-    b = mb.ModelBuilder("block", gravity=np.zeros(3))
-    b.add_body("block", mass=2.0)
-    b.add_joint("x", "prismatic", parent="world", child="block", axis=(1, 0, 0), friction=f)
+    b = mounted("block", "block", "x", "prismatic", gravity=np.zeros(3), mass=2.0, axis=(1, 0, 0), friction=f)
     torque = None if clock else lambda t, q, v: [pull * np.sin(omega * t)]  # noqa: ARG005
     if clock:
         b.add_joint_force("pull", "x", lambda t, q, v: pull * np.sin(omega * t))  # noqa: ARG005
@@ -506,11 +430,9 @@ def test_what_turns_in_moreau_s_step_is_held_by_its_stiction(
     # Of first order.
     assert errors[1] < 2e-3
     assert errors[1] < 0.6 * errors[0]
-    other = mb.simulate(mb.dynamics(model, "pinocchio"), *start, "moreau", dt=4e-3, save=[4.0])
     monkeypatch.setattr(moreau, "_compiles", lambda _: False)
     slow = mb.simulate(dyn, *start, "moreau", dt=4e-3, save=[4.0])
     assert coarse.q[-1] == pytest.approx(slow.q[-1], abs=1e-12)
-    assert coarse.q[-1] == pytest.approx(other.q[-1], abs=1e-12)
 
 
 def test_a_last_step_of_moreau_that_is_shorter_is_so_in_machine_code() -> None:
@@ -586,9 +508,6 @@ def test_an_mjcf_with_friction_on_a_ball_or_free_joint_loads_without_it_and_says
     assert [j.friction.tolist() for j in model.joints] == [[0.0] * 6, [0.0] * 3, [0.1]]
     for joint in ("free joint 'base'", "ball joint 'hip'"):
         assert sum(joint in note and "left out" in note for note in model.notes) == 1
-    (parsed,) = mb.compare_parsers(path, ("mujoco",)).importers
-    assert parsed.agrees
-    assert sum("left out" in note for note in parsed.notes) == 2
 
 
 def test_a_builder_gives_stiction_to_a_joint_that_had_none_and_takes_it_away_with_friction() -> None:
@@ -605,29 +524,18 @@ def test_a_builder_gives_stiction_to_a_joint_that_had_none_and_takes_it_away_wit
 
 
 def joint_with(kind: str = "revolute", **numbers: object) -> Model:
-    b = mb.ModelBuilder("bad")
-    b.add_body("body", mass=1.0, inertia=np.ones(3))
-    b.add_joint(
-        "hinge", kind, parent="world", child="body", **({"axis": (0, 0, 1)} if kind == "revolute" else {}), **numbers
-    )
-    return b.build()
+    axis = {"axis": (0, 0, 1)} if kind == "revolute" else {}
+    return mounted("bad", "body", "hinge", kind, mass=1.0, inertia=np.ones(3), **axis, **numbers).build()
 
 
 @pytest.mark.parametrize(
     ("numbers", "says"),
     [
         ({"friction": -1.0}, "friction"),
-        ({"friction": np.inf}, "finite"),
-        ({"friction": np.nan}, "friction"),
-        ({"friction": "much"}, "friction"),
-        ({"friction": [1.0, 2.0]}, "friction"),
         ({"friction": 2.0, "stiction": 1.0}, "stiction"),
-        ({"friction": 0.0, "stiction": -1.0}, "stiction"),
-        ({"friction": 0.0, "stiction": np.inf}, "finite"),
         ({"friction": 1.0, "stribeck_velocity": 1.0}, "stiction"),
         ({"friction": 1.0, "stiction": 2.0, "stribeck_velocity": -1.0}, "stribeck_velocity"),
         ({"kind": "ball", "friction": 1.0}, "moving axes"),
-        ({"kind": "free", "friction": 1.0}, "moving axes"),
         ({"kind": "planar", "stiction": [1.0, -1.0, 0.0]}, "stiction"),
     ],
 )
@@ -639,9 +547,9 @@ def test_impossible_friction_is_refused_by_name(numbers: dict[str, object], says
 
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
 def test_a_check_of_the_step_sees_no_mode_in_the_jump_of_friction_and_derivatives_at_rest_warn(engine):
-    b = mb.ModelBuilder("block", gravity=(0, 0, 0))
-    b.add_body("m", mass=2.0)
-    b.add_joint("x", "prismatic", parent="world", child="m", axis=(1, 0, 0), friction=3.0, stiffness=50.0)
+    b = mounted(
+        "block", "m", "x", "prismatic", gravity=(0, 0, 0), mass=2.0, axis=(1, 0, 0), friction=3.0, stiffness=50.0
+    )
     dyn = mb.dynamics(b.build(), engine)
     run = mb.simulate(dyn, [1.0], [0.0], 0.2, "rk4", 1e-3)
     assert run.check()
@@ -652,12 +560,11 @@ def test_a_check_of_the_step_sees_no_mode_in_the_jump_of_friction_and_derivative
         dyn.linearize([0.1], [1.0], [0.0])
 
 
-@pytest.mark.parametrize("method", ["rk4", "rk853", "moreau"])
-@pytest.mark.parametrize("calls", [0, 60])
+@pytest.mark.parametrize(("method", "calls"), [("rk4", 0), ("rk853", 60), ("moreau", 60)])
 def test_a_torque_that_fails_where_a_phase_is_looked_at_keeps_the_run(method, calls):
-    b = mb.ModelBuilder("block", gravity=(0, 0, 0))
-    b.add_body("m", mass=2.0)
-    b.add_joint("x", "prismatic", parent="world", child="m", axis=(1, 0, 0), friction=3.0, stiffness=50.0)
+    b = mounted(
+        "block", "m", "x", "prismatic", gravity=(0, 0, 0), mass=2.0, axis=(1, 0, 0), friction=3.0, stiffness=50.0
+    )
     asked = itertools.count()
 
     def torque(_t, _q, _v):

@@ -101,12 +101,7 @@ TURNING = tuple(kind for kind in SOUND if kind in IN_MUJOCO)
 STACKED = ("revolute", "universal", "spherical_zyx")
 BARE = {"springs": False, "damping": False, "armature": False}
 MODELS = {
-    "floating": lambda: mb.load("ur5", floating_base=True),
-    "mimic": lambda: mb.load("kinova"),
     "turning": lambda: random_tree(1, 12, TURNING, **BARE),
-    "helical": lambda: random_tree(
-        1, 6, ("helical", "fixed", "prismatic"), springs=False, damping=False, armature=False
-    ),
     "universal": lambda: random_tree(2, 6, STACKED, **BARE),
     "springs": chain,
     "between": between,
@@ -149,7 +144,7 @@ def test_terms_are_those_of_the_oracle(engine, name):
     if engine == "drake":
         pytest.importorskip("pydrake")
     version = present(engine, installed(PACKAGES[engine].distribution))
-    if name in ("helical", "between") and engine == "mujoco":
+    if name == "between" and engine == "mujoco":
         with pytest.raises(UnsupportedError, match="helical"):
             mb.dynamics(model, version)
         return
@@ -186,22 +181,6 @@ def test_an_engine_says_what_it_is_and_what_it_cannot_give():
     run = mb.simulate(dyn, [0.1, 0.2], [0.0, 0.0], 0.01, dt=1e-3)
     other = mb.simulate(mb.dynamics(model, "lagrangian"), [0.1, 0.2], [0.0, 0.0], 0.01, dt=1e-3)
     assert run.q[-1] == pytest.approx(other.q[-1], abs=1e-12)
-
-
-def test_its_own_runs_are_those_of_the_library():
-    model = random_tree(5, 4, ("free", "revolute"), springs=False, damping=False)
-    dyn, here = mb.dynamics(model, present("mujoco", installed("mujoco"))), mb.dynamics(model, "mujoco")
-    q0, v0 = model.random_state(0)
-    for ours, theirs in zip(dyn.rollout(q0, v0, 1e-3, 20), here.rollout("rk4", q0, v0, 1e-3, None, 20), strict=True):
-        assert np.abs(ours - theirs).max() < 1e-12
-    with pytest.raises(UnsupportedError, match="rollout"):
-        mb.dynamics(model, present("pinocchio", "4.1.0")).rollout(q0, v0, 1e-3, 20)
-
-
-def test_what_does_not_travel_is_refused_by_name():
-    version = present("pinocchio", "4.1.0")
-    with pytest.raises(UnsupportedError, match="loop"):
-        mb.dynamics(mb.catalog.slider_crank(), version)
 
 
 def test_what_a_library_prints_is_no_answer():

@@ -48,11 +48,6 @@ WAYS = (*ENGINES, "compiled")
 CLOSE = 2e-13
 
 
-def close(name, own, q):
-    """Forward dynamics loses cond(M) in any arithmetic."""
-    return CLOSE if name != "forward_dynamics" else 1e-14 * np.linalg.cond(own.mass_matrix(q)).max()
-
-
 def made_by(model, way):
     return mb.dynamics(model, "lagrangian", compile=True) if way == "compiled" else mb.dynamics(model, way)
 
@@ -87,11 +82,6 @@ def answer(call, given):
 
 def arguments(letters, q, v, a, tau):
     return [{"q": q, "v": v, "a": a, "t": tau}[x] for x in letters]
-
-
-@cache
-def floating(robot, engine):
-    return mb.dynamics(mb.load(robot, floating_base=True), engine)
 
 
 @pytest.mark.parametrize("engine", list(ENGINES))
@@ -195,10 +185,12 @@ def test_every_array_is_read_rightly_or_refused(way, batch, kinds):
     dyn, own = small_tree(kinds, way), small_tree(kinds, "lagrangian")
     state = states(own.model, 2) if batch else [x[0] for x in states(own.model, 1)]
     reference = {name: call for name, call, _ in calls(own, *state)}
-    for name, call, given in calls(dyn, *state):
+    for k, (name, call, given) in enumerate(calls(dyn, *state)):
         call(**given)  # what is derived at the first call takes the fast path now
+        # All kinds in some quantities, and in each of the others a part of them, which all of them share.
+        some = slice(None) if name in ("nle", "forward_dynamics") else slice(k % 5, None, 5)
         for x, value in given.items():
-            for kind, convert in NUMBERS.items():
+            for kind, convert in [*NUMBERS.items()][some]:
                 other = given | {x: convert(value)}
                 plain = {k: np.asarray(y, dtype=float) for k, y in other.items()}
                 # Rounded to such a type a quaternion may not be of unit length.
@@ -207,7 +199,7 @@ def test_every_array_is_read_rightly_or_refused(way, batch, kinds):
                     assert str(found) == str(expected), (name, x, kind)
                 else:
                     assert off(found, expected) < 1e-10, (name, x, kind)
-            for kind, convert in NO_NUMBERS.items():
+            for kind, convert in [*NO_NUMBERS.items()][some]:
                 error = answer(call, given | {x: convert(value)})
                 assert isinstance(error, InputError), (name, x, kind)
                 assert str(error).startswith(f"{x}: expected"), (name, x, kind)
@@ -215,9 +207,7 @@ def test_every_array_is_read_rightly_or_refused(way, batch, kinds):
 
 def with_hidden_entries():
     """Yield models with coordinates that nothing reads, and with results that are an argument itself."""
-    b = mb.ModelBuilder("slide")
-    b.add_body("a", mass=1.0)
-    b.add_joint("x", "prismatic", parent="world", child="a", axis=(1, 0, 0))
+    b = mounted("slide", "a", "x", "prismatic", mass=1.0, axis=(1, 0, 0))
     b.add_body("b", mass=1.0, com=(0, 0, 1), inertia=(1, 1, 1))
     b.add_joint("y", "revolute", parent="a", child="b", axis=(0, 1, 0))
     b.add_frame("tip", body="b")
@@ -255,9 +245,7 @@ def test_no_entry_that_is_not_finite_passes_unseen(way):
 @pytest.mark.parametrize("way", WAYS)
 def test_overflow_is_an_error_in_every_quantity(way):
     """A slide of 1e200 m with 1e200 kg: products of these numbers are beyond a double."""
-    b = mb.ModelBuilder("huge")
-    b.add_body("a", mass=1.0, com=(0, 0, 1), inertia=(1, 1, 1))
-    b.add_joint("turn", "revolute", parent="world", child="a", axis=(0, 1, 0))
+    b = mounted("huge", "a", "turn", "revolute", mass=1.0, com=(0, 0, 1), inertia=(1, 1, 1), axis=(0, 1, 0))
     b.add_body("b", mass=1e200)
     b.add_joint("slide", "prismatic", parent="a", child="b", axis=(1, 0, 0))
     b.add_frame("tip", body="b")
@@ -363,9 +351,9 @@ def test_threads_that_share_an_engine_get_the_values_of_their_own_states(name, e
 
 def test_mujoco_writes_no_log_and_gives_no_number_where_there_is_none(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    b = mb.ModelBuilder("twice")
-    b.add_body("a", mass=1.0, com=(0, 0, -1), inertia=(1, 1, 1))
-    b.add_joint("j", "universal", parent="world", child="a", axis=(1, 0, 0), axis2=(1, 0, 0))
+    b = mounted(
+        "twice", "a", "j", "universal", mass=1.0, com=(0, 0, -1), inertia=(1, 1, 1), axis=(1, 0, 0), axis2=(1, 0, 0)
+    )
     with pytest.warns(mb.errors.NonPhysicalWarning):
         model = b.build(nonphysical="warn")
     dyn = mb.dynamics(model, "mujoco")

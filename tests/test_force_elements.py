@@ -13,7 +13,7 @@ import sympy as sp
 from scipy.spatial.transform import Rotation
 
 import mbkit as mb
-from mbkit.errors import ModelError, UnsupportedError
+from mbkit.errors import ModelError
 from mbkit.simulate import METHODS
 from tests.scenes import mounted
 
@@ -152,9 +152,9 @@ def test_a_bushing_acts_on_the_rates_of_its_displacement() -> None:
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.031, 0.0316, 0.032, 0.5, 2.0, 3.1])
 def test_a_rotation_vector_is_exact_at_every_angle(angle: float) -> None:
     """0.0316 rad is where the series ends; the oracle holds its digits on both sides."""
-    b = mb.ModelBuilder("twist", gravity=(0, 0, 0))
-    b.add_body("disc", mass=1.0, inertia=(1.0, 1.0, 1.0))
-    b.add_joint("turn", "revolute", parent="world", child="disc", axis=(0, 0, 1))
+    b = mounted(
+        "twist", "disc", "turn", "revolute", gravity=(0, 0, 0), mass=1.0, inertia=(1.0, 1.0, 1.0), axis=(0, 0, 1)
+    )
     b.add_bushing("shaft", body_a="world", body_b="disc", stiffness=[0, 0, 0, 5.0, 6.0, 7.0])
     model = b.build()
     with mpmath.workdps(40):
@@ -228,8 +228,7 @@ def closed_form(t0: float, t: float) -> tuple[float, float]:
     return -c / 5 * (math.cos(5 * t) - math.cos(5 * t0)) - c * math.sin(5 * t0) * (t - t0), v
 
 
-@pytest.mark.thorough("rk4", "implicit_midpoint", "gauss4", "gauss6", "radau")
-@pytest.mark.parametrize("name", [n for n, m in METHODS.items() if not m.engines or "lagrangian" in m.engines])
+@pytest.mark.parametrize("name", ["semi_implicit_euler", "gauss6", "rk853", "taylor"])
 def test_every_method_starts_at_t0_and_follows_the_time(name: str) -> None:
     method, t0, duration = METHODS[name], 0.4, 1.0
     dyn = mb.dynamics(slider(), "lagrangian")
@@ -245,45 +244,7 @@ def test_every_method_starts_at_t0_and_follows_the_time(name: str) -> None:
     assert abs(run.v[-1, 0] - v) < worst
 
 
-def test_wrenches_of_a_run_stand_beside_a_force_of_the_time() -> None:
-    b = tree()
-    b.add_force("wave", "tip", force=(ca.sin(3 * ca.SX.sym("t")), 0, 0), axes="local_world_aligned")
-    model = b.build()
-    q, v, push = model.neutral(), np.zeros(model.nv), {"tip": [0.0, 1.0, 0, 0, 0, 0.5]}
-    runs = [
-        mb.simulate(mb.dynamics(model, engine), q, v, 0.1, "rk4", 0.01, t0=0.2, wrenches=push)
-        for engine in ("lagrangian", "pinocchio", "mujoco")
-    ]
-    for run in runs[1:]:
-        assert np.abs(run.q - runs[0].q).max() < 1e-13
-
-
 # The description
-
-
-def test_joint_forces_are_written_out_in_symbols() -> None:
-    def double() -> mb.ModelBuilder:
-        b = mb.ModelBuilder("double")
-        for name, parent, z in (("one", "world", 0.0), ("two", "one", -1.0)):
-            b.add_body(name, mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.02))
-            b.add_joint(f"j{name}", "revolute", parent=parent, child=name, axis=(0, 1, 0), translation=(0, 0, z))
-        return b
-
-    b = double()
-    k, q, other = sp.symbols("k q jone")
-    b.add_joint_force("f", "jone", lambda t, _q, v: -2 * v * abs(v) + ca.sin(3 * t), potential=lambda q: 2 * q**4)
-    law = -k * sp.sin(q - other) * sp.Piecewise((1, q > 0), (2, True))
-    b.add_joint_force("g", "jtwo", law, parameters={"k": mb.Parameter("k", 3.0)})
-    model = b.build()
-    lag = mb.lagrangian.from_model(model)
-    assert sp.Symbol("jone") ** 4 * 2 in lag.V.args
-    q, v = model.random_state(1, 20)
-    own, paper = mb.dynamics(model, "lagrangian").at(t=0.4), lag.dynamics().at(t=0.4)
-    assert off(paper.forward_dynamics(q, v, 0 * v), own.forward_dynamics(q, v, 0 * v)) < 1e-13
-    b = double()
-    b.add_force("push", "two", force=(1.0, 0, 0))
-    with pytest.raises(UnsupportedError, match="force 'push' on 'two'"):
-        mb.lagrangian.from_model(b.build())
 
 
 # Bad input
@@ -297,7 +258,7 @@ def fault(add: Any) -> str:
     return str(caught.value)
 
 
-t_, q_, v_, x_ = (ca.SX.sym(n) for n in ("t", "q", "v", "stray"))
+q_, v_, x_ = (ca.SX.sym(n) for n in ("q", "v", "stray"))
 
 
 @pytest.mark.parametrize(
@@ -305,32 +266,22 @@ t_, q_, v_, x_ = (ca.SX.sym(n) for n in ("t", "q", "v", "stray"))
     [
         (lambda b: b.add_joint_force("f", "elbow", -q_ * x_), ["force 'f'", "unknown symbol 'stray'", "parameters="]),
         (lambda b: b.add_joint_force("f", "elbow", -ca.SX.sym("shouldr")), ["did you mean 'shoulder'"]),
-        (lambda b: b.add_joint_force("f", "elbo", -q_), ["unknown joint 'elbo'", "'elbow'"]),
         (lambda b: b.add_joint_force("f", "float", -ca.SX.sym("q_0")), ["expected 6 components, got 1"]),
         (lambda b: b.add_joint_force("f", "elbow"), ["never act"]),
         (lambda b: b.add_joint_force("f", "elbow", potential=v_**2), ["potential", "'v'"]),
-        (lambda b: b.add_joint_force("f", "elbow", potential=q_ * t_), ["potential", "'t'"]),
         (lambda b: b.add_joint_force("f", "elbow", -q_, parameters={"k": 1.0}), ["'k'", "in no expression"]),
-        (lambda b: b.add_joint_force("f", "elbow", -q_, parameters={"q": 1.0}), ["symbol 'q' stands for", "rename"]),
         (lambda b: b.add_joint_force("f", "elbow", ca.MX.sym("q")), ["expected a casadi.SX, got an MX"]),
         (lambda b: b.add_joint_force("f", "elbow", lambda _t, q, _v: math.sin(q)), ["the function raised", "torque="]),
         (
             lambda b: b.add_joint_force("f", "elbow", lambda _t, q, _v: np.interp(q, [0.0, 1.0], [0.0, 2.0])),
             ["calls numpy.interp, which takes numbers alone", "casadi.pw_lin", "torque="],
         ),
-        (lambda b: b.add_joint_force("f", "elbow", lambda _t, q, _v: 1.0 if q > 0 else 2.0), ["the function raised"]),
-        (lambda b: b.add_joint_force("f", "elbow", sp.gamma(sp.Symbol("q"))), ["gamma"]),
         (lambda b: b.add_joint_force("f", "elbow", math.nan), ["finite"]),
         (lambda b: b.add_force("f", "tp", force=(1, 0, 0)), ["unknown frame 'tp'", "'tip'"]),
-        (lambda b: b.add_force("f", "tip", force=(1, 0)), ["expected 3 numbers, got 2"]),
         (lambda b: b.add_force("f", "tip", force=(1, 0, 0), axes="global"), ["axes", "'global'"]),
-        (lambda b: [b.add_force("f", "tip", force=(1, 0, 0)) for _ in "ab"], ["declared 2 times"]),
         (lambda b: b.add_bushing("b", body_a="base", body_b="base", stiffness=1.0), ["both frames on 'base'"]),
-        (lambda b: b.add_bushing("b", body_a="base", body_b="lowe", stiffness=1.0), ["'lowe'", "'lower'"]),
         (lambda b: b.add_bushing("b", body_a="base", body_b="lower", stiffness=np.tri(6)), ["symmetric"]),
         (lambda b: b.add_bushing("b", body_a="base", body_b="lower", damping=-1.0), ["damping", "drives the motion"]),
-        (lambda b: b.add_bushing("b", body_a="base", body_b="lower", stiffness=np.eye(3)), ["(6, 6)"]),
-        (lambda b: b.add_bushing("b", body_a="base", body_b="lower"), ["never act"]),
     ],
 )
 def test_what_is_no_force_is_refused_with_the_reason(add: Any, words: list[str]) -> None:
@@ -340,9 +291,7 @@ def test_what_is_no_force_is_refused_with_the_reason(add: Any, words: list[str])
 
 
 def test_a_symbol_with_two_meanings_is_refused() -> None:
-    b = mb.ModelBuilder("cart")
-    b.add_body("cart", mass=1.0)
-    b.add_joint("x", "prismatic", parent="world", child="cart", axis=(1, 0, 0))
+    b = mounted("cart", "cart", "x", "prismatic", mass=1.0, axis=(1, 0, 0))
     b.add_force("f", "cart", force=(-ca.SX.sym("x"), 0, 0))
     with pytest.raises(ModelError, match="'x' stands for one of its own arguments and a coordinate"):
         b.build()

@@ -22,6 +22,7 @@ import mbkit as mb
 from mbkit.errors import DoubtfulRunWarning, MbkitWarning
 from mbkit.model import Model
 from mbkit.simulate.solvers.in_phases import moreau
+from tests.scenes import mounted
 
 ADAPTIVE = {"rtol": 1e-11, "atol": 1e-12}
 
@@ -84,7 +85,7 @@ def crank_energies(theta: float) -> tuple[float, float]:
     return kinetic / 2, 9.81 * (crank * R / 2 * np.sin(theta) + coupler * (R * np.sin(theta) + L / 2 * np.sin(phi)))
 
 
-@pytest.mark.thorough(every=3)
+@pytest.mark.thorough(every=5)
 @pytest.mark.parametrize(("engine", "method", "most", "t0"), [
     ("lagrangian", "rk853", 1e-9, 0.0), ("lagrangian", "dop853", 1e-9, 0.0), ("lagrangian", "rodas5", 1e-8, 0.0),
     ("lagrangian", "rk4", 2e-7, 0.0), ("lagrangian", "gauss4", 2e-7, 0.0), ("pinocchio", "dop853", 1e-9, 0.0),
@@ -162,7 +163,7 @@ def four_bar_weight(theta: float) -> float:
     return float(four_bar_terms(theta + 1e-40j)[-1].imag / 1e-40)
 
 
-@pytest.mark.thorough(every=5)
+@pytest.mark.thorough(every=7)
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "compiled"])
 @pytest.mark.parametrize(("method", "more"), [
     ("rk853", ADAPTIVE), ("dop853", ADAPTIVE), ("rk4", {"dt": 0.01}), ("gauss4", {"dt": 0.01}),
@@ -218,7 +219,7 @@ def rotors(kind: str, ratio: float, friction: tuple[float, float], stiction: flo
     return b.build()
 
 
-@pytest.mark.thorough(every=2)
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("kind", ["geared", "mimic"])
 @pytest.mark.parametrize(("method", "more"), [("rk853", ADAPTIVE), ("rk4", {"dt": 0.01}), ("moreau", {"dt": 0.01})])
 def test_a_gear_comes_to_rest_and_is_pulled_loose_as_one_rotor(kind: str, method: str, more: dict[str, float]) -> None:
@@ -250,9 +251,8 @@ def test_a_gear_comes_to_rest_and_is_pulled_loose_as_one_rotor(kind: str, method
 
 def test_a_cart_on_a_wheel_that_rolls_has_the_friction_of_its_axle() -> None:
     """Rows of height and of the side say nothing new there."""
-    b = mb.ModelBuilder("cart", gravity=(2.0, 0, -9.81))
-    b.add_body("cart", mass=2.0, inertia=np.ones(3))
-    b.add_joint("x", "prismatic", parent="world", child="cart", axis=(1, 0, 0), translation=(0, 0, 0.25), friction=1.0)
+    place = {"axis": (1, 0, 0), "translation": (0, 0, 0.25), "friction": 1.0}
+    b = mounted("cart", "cart", "x", "prismatic", gravity=(2.0, 0, -9.81), mass=2.0, inertia=np.ones(3), **place)
     b.add_body("wheel", mass=1.0, inertia=(1.0, 0.03, 1.0))
     b.add_joint("axle", "continuous", parent="cart", child="wheel", axis=(0, 1, 0), friction=0.5)
     b.add_rolling("road", "disc", body_a="wheel", radius=0.25, axis_a=(0, 1, 0))
@@ -321,9 +321,7 @@ def test_a_disc_that_falls_flat_does_so_as_on_paper_and_ends_by_name() -> None:
 
 def shaken(phase: float = 0.0, of_table: float = 0.7) -> Model:
     """Return a block of 1.5 kg on a table that is shaken, in coordinates of the table."""
-    b = mb.ModelBuilder("table", gravity=(0, 0, 0))
-    b.add_body("table", mass=5.0)
-    b.add_joint("x", "prismatic", parent="world", child="table", axis=(1, 0, 0), friction=of_table)
+    b = mounted("table", "table", "x", "prismatic", gravity=(0, 0, 0), mass=5.0, axis=(1, 0, 0), friction=of_table)
     b.add_body("block", mass=1.5)
     b.add_joint("y", "prismatic", parent="table", child="block", axis=(1, 0, 0), friction=2.0, stiction=3.0)
     b.prescribe("x", amplitude=0.5, frequency=3.0, phase=phase)
@@ -430,16 +428,9 @@ def test_phases_beside_a_drive_are_kept_for_their_time(engine: str) -> None:
     assert phase.model.time == 0.0
 
 
-def test_what_has_no_friction_is_in_no_event() -> None:
-    run = simulated(mb.dynamics(shaken(of_table=0.0), "lagrangian"), [0.0, 0.0], [1.5, 0.0], 2.0, "rk853", **ADAPTIVE)
-    assert names(run) == ["y lets go", "y turns"]
-
-
 def test_what_a_drive_lets_rest_goes_on_with_it() -> None:
     """The table moves from 1 s to 2 s; the block slides on it, and rests by itself later on."""
-    b = mb.ModelBuilder("dwell", gravity=(0, 0, 0))
-    b.add_body("table", mass=5.0)
-    b.add_joint("x", "prismatic", parent="world", child="table", axis=(1, 0, 0), friction=0.7)
+    b = mounted("dwell", "table", "x", "prismatic", gravity=(0, 0, 0), mass=5.0, axis=(1, 0, 0), friction=0.7)
     b.add_body("block", mass=1.5)
     b.add_joint("y", "prismatic", parent="table", child="block", axis=(1, 0, 0), friction=1.0)
     from scipy.interpolate import PPoly
@@ -454,13 +445,12 @@ def test_what_a_drive_lets_rest_goes_on_with_it() -> None:
     back = table(begin) - table(turn) + speed(begin) * (turn - begin) + f * (turn - begin) ** 2 / 2
     left = speed(turn) - f * (1 - turn)
     on = table(turn) - 1 + speed(turn) * (1 - turn) - f * (1 - turn) ** 2 / 2 + left**2 / (2 * f)
-    for method, more in (("rk853", ADAPTIVE), ("rk4", {"dt": 0.01})):
-        run = simulated(dyn, [0.0, 0.0], [0.0, 0.0], 5.0, method, **more)
-        times = {e.name: e.t for e in run.events}
-        assert times["y lets go"] == pytest.approx(1 + begin, abs=1e-7)
-        assert times["y stops"] == pytest.approx(2 + left / f, abs=1e-7)
-        assert run.q[-1] == pytest.approx([1.0, back + on], abs=1e-7)
-        assert (run.v[run.t > times["y stops"], 1] == 0).all()
+    run = simulated(dyn, [0.0, 0.0], [0.0, 0.0], 5.0, "rk853", **ADAPTIVE)
+    times = {e.name: e.t for e in run.events}
+    assert times["y lets go"] == pytest.approx(1 + begin, abs=1e-7)
+    assert times["y stops"] == pytest.approx(2 + left / f, abs=1e-7)
+    assert run.q[-1] == pytest.approx([1.0, back + on], abs=1e-7)
+    assert (run.v[run.t > times["y stops"], 1] == 0).all()
 
 
 # Parallelograms, whose rows follow from each other, or are singular where all bars are in line
@@ -551,6 +541,7 @@ def test_a_run_tells_once_of_the_poses_that_its_phases_pass(
     assert times == pytest.approx([first, first + rest + back], rel=2e-3)
 
 
+@pytest.mark.thorough("1-True")
 @pytest.mark.parametrize(("count", "compiled"), [(1, True), (3, False)])
 def test_moreau_s_steps_tell_the_singular_pose_that_they_pass(count: int, compiled: bool) -> None:
     dyn = mb.dynamics(parallelogram((0.05,) * 3, 0.05), "lagrangian", compile=compiled)
@@ -611,7 +602,7 @@ def part_of_bounds(pins: np.ndarray, bounds: np.ndarray, needed: np.ndarray) -> 
     return max(abs(n @ needed) / (bounds @ np.abs(pins @ n)) for n in normals)
 
 
-@pytest.mark.thorough("lagrangian")
+@pytest.mark.thorough("lagrangian", "compiled")
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "compiled"])
 def test_a_five_bar_lets_go_where_no_share_of_its_pins_is_within_their_bounds(engine: str) -> None:
     """The forces of five pins along two freedoms fill a polygon; its edges are those of its vertices' hull."""
@@ -639,7 +630,7 @@ def test_a_five_bar_lets_go_where_no_share_of_its_pins_is_within_their_bounds(en
         assert np.abs(dyn.constraint_residual(run.q[-1])).max() < 1e-12
 
 
-@pytest.mark.thorough(every=4)
+@pytest.mark.thorough(every=6)
 @pytest.mark.parametrize("friction", [1e-10 * FIVE, np.array([1e-9, 1, 1, 1e-9, 1]), np.array([1, 1e-14, 1, 1, 1])])
 @pytest.mark.parametrize(("method", "more"), [("dop853", ADAPTIVE), ("rk4", {"dt": 0.01})])
 def test_a_five_bar_lets_go_as_its_bounds_say_whatever_their_sizes(
@@ -668,13 +659,11 @@ def test_bounds_that_differ_by_14_decades_are_refused_by_name_where_the_large_on
     assert run.stats.ended == "diverged"
 
 
-@pytest.mark.thorough("pinocchio")
+@pytest.mark.thorough("lagrangian", "pinocchio")
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "compiled"])
 def test_moreau_s_steps_pass_dead_centres(engine: str) -> None:
     """The rocker turns while the others go on; a rate of the rows that is not zero would let all three never rest."""
-    b = mb.ModelBuilder("free", gravity=(0, 0, 0))
-    b.add_body("base", mass=5.0, inertia=0.3 * np.ones(3))
-    b.add_joint("base", "free", parent="world", child="base")
+    b = mounted("free", "base", "base", "free", gravity=(0, 0, 0), mass=5.0, inertia=0.3 * np.ones(3))
     for name, parent, x, length in (
         ("crank", "base", 0, 0.3),
         ("coupler", "crank", 0.3, 0.9),
@@ -704,16 +693,8 @@ CURVE = (1.0, 2.0, 0.8)
 
 
 def curved() -> Model:
-    f, s, w = CURVE
-    b = mb.ModelBuilder("stribeck", gravity=(0, -9.81, 0))
-    for name, parent, x, length in (
-        ("crank", "world", 0.0, 0.3),
-        ("coupler", "crank", 0.3, 0.9),
-        ("rocker", "world", 1.0, 0.7),
-    ):
-        numbers = {"friction": f, "stiction": s, "stribeck_velocity": w} if name == "crank" else {}
-        rod(b, name, parent, x, length, **numbers)
-    b.add_loop("pin", "point", body_a="coupler", body_b="rocker", translation_a=(0.9, 0, 0), translation_b=(0.7, 0, 0))
+    b = mb.ModelBuilder.of(four_bar().without("friction"))
+    b.set_joint("crank", **dict(zip(("friction", "stiction", "stribeck_velocity"), CURVE, strict=True)))
     return b.build()
 
 
@@ -791,7 +772,7 @@ def started(speeds: list[float]) -> tuple[np.ndarray, np.ndarray]:
     return np.array([q for q, _ in states]), np.array([x * slope for (_, slope), x in zip(states, speeds, strict=True)])
 
 
-@pytest.mark.thorough(every=3)
+@pytest.mark.thorough(every=5)
 @pytest.mark.parametrize(
     ("method", "engine"),
     [(x, "lagrangian") for x in ("rk4", "gauss4", "moreau")] + [("rk4", "compiled"), ("moreau", "compiled")],
@@ -852,7 +833,7 @@ def rubbing(name: str, seed: int, **options: bool) -> tuple[Any, np.ndarray, np.
     return dyn, *dyn.model.random_state(rng)
 
 
-@pytest.mark.thorough("five_bar", "chaplygin_sleigh")
+@pytest.mark.thorough("double_cardan_shaft", "chaplygin_sleigh")
 @pytest.mark.parametrize("name", ["five_bar", "double_cardan_shaft", "chaplygin_sleigh"])
 def test_moreau_s_steps_beside_rows_in_machine_code_are_those_in_python(
     name: str, monkeypatch: pytest.MonkeyPatch
@@ -913,7 +894,7 @@ def test_moreau_s_steps_in_machine_code_end_where_friction_has_taken_the_energy(
     assert far[1] / far[0] == pytest.approx(0.5, abs=0.1)
 
 
-@pytest.mark.thorough("planar_3rrr")
+@pytest.mark.thorough("planar_3rrr", "five_bar")
 @pytest.mark.parametrize("name", ["planar_3rrr", "five_bar", "double_cardan_shaft", "chaplygin_sleigh"])
 def test_methods_agree_on_mechanisms_with_stiction_at_all_joints(name: str) -> None:
     """A slide of the shaft rests by itself, and hardly responds to forces."""

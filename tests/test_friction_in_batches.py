@@ -16,6 +16,7 @@ from mbkit.model import Model
 from mbkit.simulate.solvers.in_phases import fixed
 from mbkit.simulate.solvers.in_phases.fixed import first_zero
 from tests.random_trees import off
+from tests.scenes import mounted
 from tests.test_dry_friction import mostly_at_rest, rubbed
 
 #: A step, and a run of so many steps with a shorter one at its end.
@@ -58,7 +59,7 @@ def require_same(batch: Any, alone: list, tolerance: float = 1e-9) -> None:
     assert len({e.t for e in batch.events}) > len(batch.events) // 2
 
 
-@pytest.mark.thorough("1-gauss4", "0-rk4", "0-gauss4")
+@pytest.mark.thorough("1-gauss4", "0-rk4", "0-gauss4", "1-semi_implicit_euler")
 @pytest.mark.parametrize("method", ["rk4", "semi_implicit_euler", "gauss4"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_members_change_phases_at_their_own_times(method: str, seed: int) -> None:
@@ -139,7 +140,7 @@ def test_steps_of_a_batch_are_those_of_its_states() -> None:
 
 
 def with_free_friction(seed: int, n: int = 3) -> tuple[Model, dict[str, np.ndarray]]:
-    """Return a model whose friction and stiction are parameters, two with a common one; and values of eight samples."""
+    """Return a model whose friction and stiction are parameters, two with a common one; and values of three samples."""
     b = mb.ModelBuilder.of(rubbed(seed, n, SINGLE))
     common, model, values = mb.Parameter("common", 1.0), b.build(), {}
     rng = np.random.default_rng(seed)
@@ -147,7 +148,7 @@ def with_free_friction(seed: int, n: int = 3) -> tuple[Model, dict[str, np.ndarr
         own = mb.Parameter(f"f{k}", float(joint.friction[0])) if k else common
         curve = None if k % 2 else 0.4
         b.set_joint(joint.name, friction=own, stiction=1.3 * own + 0.2 * common, stribeck_velocity=curve)
-        values[own.name] = rng.uniform(0.2, 3, 8)
+        values[own.name] = rng.uniform(0.2, 3, 3)
     return b.build(), values
 
 
@@ -155,12 +156,12 @@ def with_free_friction(seed: int, n: int = 3) -> tuple[Model, dict[str, np.ndarr
 @pytest.mark.parametrize("method", ["rk4", "semi_implicit_euler", "gauss4", "moreau", "rk853"])
 def test_samples_with_friction_of_their_own_are_models_with_these_numbers(method: str) -> None:
     model, values = with_free_friction(11)
-    q, v, tau = mostly_at_rest(model, 8)
+    q, v, tau = mostly_at_rest(model, 3)
     settings = {"dt": STEP} if method != "rk853" else {"save": np.linspace(0, DURATION, 5), "rtol": 1e-11}
     dyn = mb.dynamics(model, "lagrangian", compile=method == "rk4").at(**values)
     rows = tau[:, None] * np.ones((1, STEPS if "dt" in settings else 4, 1))
     batch = mb.simulate(dyn, q, v, DURATION, method, torque=rows, doubt=False, **settings)
-    for i in range(8):
+    for i in range(3):
         numbers = {name: float(x[i]) for name, x in values.items()}
         plain = mb.dynamics(model.with_parameters(**numbers), "lagrangian")
         assert not plain.model.parameters
@@ -172,7 +173,7 @@ def test_samples_with_friction_of_their_own_are_models_with_these_numbers(method
     assert method == "moreau" or batch.events
     accelerations = dyn.forward_dynamics(q, v, tau)
     stepped = dyn.step(q, v, tau, STEP)
-    for i in range(8):
+    for i in range(3):
         plain = mb.dynamics(model.with_parameters(**{name: float(x[i]) for name, x in values.items()}), "pinocchio")
         assert off(accelerations[i], plain.forward_dynamics(q[i], v[i], tau[i])) < 1e-9
         assert off(stepped[0][i], plain.step(q[i], v[i], tau[i], STEP)[0]) < 1e-9
@@ -203,9 +204,7 @@ def test_friction_is_freed_and_varied_like_other_numbers() -> None:
 @pytest.mark.parametrize("compiled", [True, False])
 def test_what_rests_lets_go_where_a_wrench_passes_its_bound(method: str, compiled: bool) -> None:
     """2 kg under 2 N and then 3.5 N against a friction of 3 N: v = 0.25 m/s² (t - 0.1 s)."""
-    b = mb.ModelBuilder("block", gravity=(0, 0, 0))
-    b.add_body("m", mass=2.0)
-    b.add_joint("x", "prismatic", parent="world", child="m", axis=(1, 0, 0), friction=3.0)
+    b = mounted("block", "m", "x", "prismatic", gravity=(0, 0, 0), mass=2.0, axis=(1, 0, 0), friction=3.0)
     dyn = mb.dynamics(b.build(), "lagrangian", compile=compiled)
     wrench = np.zeros((2, 20, 6))
     wrench[:, :10, 0], wrench[:, 10:, 0] = 2.0, [[3.5], [-2.9]]
@@ -219,9 +218,7 @@ def test_what_rests_lets_go_where_a_wrench_passes_its_bound(method: str, compile
 
 def test_variants_of_friction_slide_as_in_the_closed_form() -> None:
     """x = v t - f t²/2m of blocks that do not stop, each with a friction of its own."""
-    b = mb.ModelBuilder("slid")
-    b.add_joint("x", "prismatic", parent="world", child="block", axis=(1, 0, 0), friction=1.0)
-    b.add_body("block", mass=1.0)
+    b = mounted("slid", "block", "x", "prismatic", mass=1.0, axis=(1, 0, 0), friction=1.0)
     many = mb.variants(b.build(point_masses=True), {"x.friction": 0.2}, size=5, seed=1)
     run = mb.simulate(many.dynamics("lagrangian"), np.zeros((5, 1)), np.full((5, 1), 3.0), 1.0, dt=0.01)
     drawn = np.array(many.values["x.friction"])
@@ -229,7 +226,7 @@ def test_variants_of_friction_slide_as_in_the_closed_form() -> None:
     np.testing.assert_allclose(run.q[:, -1, 0], 3.0 - drawn / 2, rtol=0, atol=1e-13)
 
 
-@pytest.mark.thorough("rk853-True-1e-08")
+@pytest.mark.thorough("rk853-True-1e-08", "rk4-False-1e-06")
 @pytest.mark.parametrize(("method", "compiled", "most"), [
     ("rk853", False, 1e-8), ("rk853", True, 1e-8), ("rk4", False, 1e-6), ("rk4", True, 1e-6), ("moreau", True, 2e-2),
 ])  # fmt: skip
@@ -237,9 +234,18 @@ def test_a_joint_whose_friction_is_zero_in_a_member_has_no_phases_there(
     method: str, compiled: bool, most: float
 ) -> None:
     """A pendulum with a parameter as friction by SciPy's integrator, a block that slides 0.412 s, and one at rest."""
-    b = mb.ModelBuilder("beside", gravity=(0, -9.81, 0))
-    b.add_body("a", mass=1.0, com=(0.5, 0, 0), inertia=0.1 * np.ones(3))
-    b.add_joint("a", "continuous", parent="world", child="a", axis=(0, 0, 1), friction=mb.Parameter("f", 1.0))
+    place = {"axis": (0, 0, 1), "friction": mb.Parameter("f", 1.0)}
+    b = mounted(
+        "beside",
+        "a",
+        "a",
+        "continuous",
+        gravity=(0, -9.81, 0),
+        mass=1.0,
+        com=(0.5, 0, 0),
+        inertia=0.1 * np.ones(3),
+        **place,
+    )
     for name in "xy":
         b.add_body(name, mass=2.0)
         b.add_joint(name, "prismatic", parent="world", child=name, axis=(1, 0, 0), friction=3.0)

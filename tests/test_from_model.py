@@ -17,7 +17,7 @@ from mbkit.lagrangian.summary import in_symbols, letters
 from mbkit.lagrangian.system import QuasiLagrangian
 from mbkit.lagrangian.trig.shortest_form import number
 from mbkit.lagrangian.trig.simplify import forms, settled, tidy
-from mbkit.model.parts import Loop, Prescribed
+from mbkit.model.parts import Loop
 from mbkit.spatial import matrix_from_quaternion
 from tests.random_trees import off, random_tree, states
 from tests.scenes import mounted
@@ -93,22 +93,7 @@ def test_ball_and_free_joints_move_as_they_do_in_their_own_velocities(seed, kind
     assert_same(model, lag)
 
 
-@pytest.mark.thorough
-def test_springs_dampers_and_forces_by_functions_act_on_what_ball_and_free_joints_carry():
-    b = mb.ModelBuilder("tug", gravity=(0, 0.5, -9.81))
-    for name, kind, parent in (("hub", "free", "world"), ("bob", "ball", "hub")):
-        b.add_body(name, mass=1.5, com=(0.1, 0.2, -0.3), inertia=(0.2, 0.3, 0.4))
-        b.add_joint(name, kind, parent=parent, child=name, translation=(0.2, 0, 0.1), damping=0.3)
-    b.add_spring("line", body_a="world", body_b="bob", point_a=(1, 2, 3), stiffness=30.0, rest_length=0.5, damping=3.0)
-    # Formulas read the quaternion, which has either sign.
-    q, v = sp.symbols("q_0:4"), sp.symbols("v_0:3")
-    b.add_joint_force(
-        "push", "bob", [-q[0] * q[3], 0.3 * q[1] ** 2 - 0.1 * v[1], v[0] * q[2] * q[3]], potential=q[0] * q[1]
-    )
-    assert_same(b.build(), from_model(b.build()))
-
-
-def satellite(links: int = 1, **arm: object) -> mb.Model:
+def satellite(links: int = 1) -> mb.Model:
     """Return a hub that floats, with an arm of thin links."""
     b = mb.ModelBuilder("satellite", gravity=(0, 0, 0))
     values = {"m_0": 100.0, "I1": 10.0, "I2": 12.0, "I3": 9.0, "m_1": 5.0, "J": 1.0, "l": 1.0}
@@ -118,7 +103,7 @@ def satellite(links: int = 1, **arm: object) -> mb.Model:
     for k in range(1, links + 1):
         b.add_body(f"link{k}", mass=m_1, com=(length, 0, 0), inertia=(0, J, J))
         carrier, at = (f"link{k - 1}", (2 * length, 0, 0)) if k > 1 else ("hub", (length, 0, 0))
-        b.add_joint(f"q{k}", "revolute", parent=carrier, child=f"link{k}", axis=(0, 0, 1), translation=at, **arm)
+        b.add_joint(f"q{k}", "revolute", parent=carrier, child=f"link{k}", axis=(0, 0, 1), translation=at)
     return b.build()
 
 
@@ -140,7 +125,7 @@ def test_newton_and_euler_s_equations_come_out_of_a_free_body():
 
 
 def test_a_satellite_with_an_arm_moves_on_paper_as_it_does():
-    model = satellite(1, damping=0.2)
+    model = satellite(1)
     lag = from_model(model)
     # The pose of the base stands in no term but the kinematics.
     pose = {*lag.coordinates[:6]}
@@ -160,31 +145,15 @@ def test_a_satellite_with_an_arm_moves_on_paper_as_it_does():
     # Angles may differ by whole turns.
     assert np.abs(np.sin((runs[0].q - in_chart(model, runs[1].q)) / 2)).max() < 1e-10
     # The momenta that the symbols call conserved are so, without a force.
-    free = from_model(satellite(1))
-    run = mb.simulate(
-        free.dynamics(options={"compile": False}), runs[0].q[0], v[0], 0.5, "rk853", rtol=1e-12, save=[0.0, 0.5]
-    )
-    symbols = (*free.coordinates, *free.velocities, *free.parameters)
-    for kept in free.conserved_quantities():
+    dyn = lag.dynamics(options={"compile": False})
+    run = mb.simulate(dyn, runs[0].q[0], v[0], 0.5, "rk853", rtol=1e-12, save=[0.0, 0.5])
+    symbols = (*lag.coordinates, *lag.velocities, *lag.parameters)
+    for kept in lag.conserved_quantities():
         value = sp.lambdify(symbols, kept.expression)
-        first, last = (value(*a, *b, *free.parameters.values()) for a, b in zip(run.q, run.v, strict=True))
+        first, last = (value(*a, *b, *lag.parameters.values()) for a, b in zip(run.q, run.v, strict=True))
         assert last == pytest.approx(first, abs=1e-9)
     with pytest.raises(InputError, match="singular at"):
-        mb.simulate(free.dynamics(options={"compile": False}), [0, 0, 0, 0, np.pi / 2, 0, 0], v[0], 0.1, "rk4", dt=0.1)
-
-
-def test_an_arm_that_is_driven_turns_the_satellite():
-    """Against the tree's own equations, with the arm's acceleration given."""
-    model = satellite(1)
-    driven = replace(model, prescribed=(Prescribed("q1", rate=0.7, offset=0.2),))
-    lag = from_model(driven)
-    assert len(lag.coordinates) == 6
-    q, v, _, tau = states(model, 3)
-    q[:, -1], v[:, -1] = 0.2, 0.7
-    ref = mb.dynamics(model, "lagrangian", compile=False)
-    ours = lag.dynamics(options={"compile": False}).forward_dynamics(in_chart(model, q)[:, :6], v[:, :6], tau[:, :6])
-    a = np.hstack([ours, np.zeros((3, 1))])
-    assert off(ref.inverse_dynamics(q, v, a)[:, :6], tau[:, :6]) < 1e-12
+        mb.simulate(dyn, [0, 0, 0, 0, np.pi / 2, 0, 0], v[0], 0.1, "rk4", dt=0.1)
 
 
 def test_names_of_several_free_bodies_differ():
@@ -203,9 +172,17 @@ def test_names_of_several_free_bodies_differ():
 
 def test_named_parameters_stay_and_move():
     m, c = mb.Parameter("bob", 0.7), mb.Parameter("c", 0.2)
-    b = mb.ModelBuilder("swing")
-    b.add_body("bob", mass=m, com=(0, 0, -0.5 * c / m), inertia=(c**2, c**2 + 0.005, c**0.5 / 50))
-    b.add_joint("swing", "revolute", parent="world", child="bob", axis=(0, 1, 0), damping=c, stiffness=m * c, rest=0.1)
+    place = {"axis": (0, 1, 0), "damping": c, "stiffness": m * c, "rest": 0.1}
+    b = mounted(
+        "swing",
+        "bob",
+        "swing",
+        "revolute",
+        mass=m,
+        com=(0, 0, -0.5 * c / m),
+        inertia=(c**2, c**2 + 0.005, c**0.5 / 50),
+        **place,
+    )
     model = b.build()
     lag = from_model(model)
     assert {s.name for s in lag.parameters} == {"bob", "c"}
@@ -240,9 +217,18 @@ def test_squares_are_found():
 
 
 def test_gravity_is_not_lost_in_products():
-    b = mb.ModelBuilder("rod", gravity=(0, 0, -9.81))
-    b.add_body("rod", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.1))
-    b.add_joint("theta", "revolute", parent="world", child="rod", axis=(0, 1, 0))
+    place = {"axis": (0, 1, 0)}
+    b = mounted(
+        "rod",
+        "rod",
+        "theta",
+        "revolute",
+        gravity=(0, 0, -9.81),
+        mass=1.0,
+        com=(0, 0, -0.5),
+        inertia=(0.1, 0.1, 0.1),
+        **place,
+    )
     lag = mb.lagrangian.from_model(b.build())
     assert str(lag.equations()) == "0.35*thetaddot + g*sin(theta)/2 = 0"
     assert {s.name: x for s, x in lag.parameters.items()} == {"g": 9.81}
@@ -320,17 +306,6 @@ def test_letters_for_coordinates_of_long_names():
 
 
 @pytest.mark.thorough
-def test_the_remedy_for_a_model_that_is_too_large_works():
-    panda = mb.load("panda")
-    grip = Loop("grip", "point", panda.bodies[-1].name, np.eye(3), np.zeros(3), "world", np.eye(3), np.ones(3))
-    model = replace(panda, loops=(grip,), prescribed=(Prescribed(panda.joint_names[0], rate=1.0),))
-    with pytest.raises(UnsupportedError, match="too many terms") as refusal:
-        from_model(model)
-    assert 'dynamics(model, "lagrangian") computes the same' in str(refusal.value)
-    assert len(mb.dynamics(model, "lagrangian", compile=False).constraint_names) == 4
-
-
-@pytest.mark.thorough
 def test_what_cannot_be_written_is_refused_with_the_reason():
     with pytest.raises(UnsupportedError, match=r"too many terms.*dynamics\(model, "):
         from_model(mb.load("panda"))
@@ -369,8 +344,7 @@ def test_short_forms(long, short):
     assert tidy(long).count_ops() <= sp.sympify(short).count_ops()
 
 
-@pytest.mark.thorough("0", "1", "3", "4")
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [2, 5])
 def test_short_forms_are_equal(seed):
     rng = np.random.default_rng(seed)
 
@@ -397,23 +371,6 @@ def test_fractions_where_people_write_them():
     assert number(Fraction(1, 12)) == sp.Rational(1, 12)
     assert number(Fraction("9.81")) == sp.Float(9.81)
     assert number(Fraction(7, 2)) == sp.Rational(7, 2)
-
-
-@pytest.mark.thorough
-def test_loops_are_written_out_beyond_what_anybody_reads():
-    # The engines refuse loops, so that nothing else computes them.
-    b = mb.ModelBuilder("row", gravity=(0, -9.81, 0))
-    for k in range(13):
-        b.add_body(f"rod{k}", mass=1.0, com=(0.5, 0, 0))
-        b.add_joint(f"a{k}", "continuous", parent="world", child=f"rod{k}", axis=(0, 0, 1), translation=(k, 0, 0))
-    for k in range(12):
-        b.add_body(f"bar{k}", mass=float(k > 0), com=(0.5, 0, 0))
-        b.add_joint(f"c{k}", "continuous", parent=f"rod{k}", child=f"bar{k}", axis=(0, 0, 1), translation=(1, 0, 0))
-        ends = {"translation_a": (1, 0, 0), "translation_b": (1, 0, 0)}
-        b.add_loop(f"pin{k}", "point", body_a=f"bar{k}", body_b=f"rod{k + 1}", **ends)
-    # The first coupler has no mass, and the loop moves it.
-    lag = from_model(b.build())
-    assert (len(lag.coordinates), len(lag.constraints)) == (25, 24)
 
 
 def test_angles_that_cancel_are_left_out_and_signs_stay():

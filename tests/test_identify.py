@@ -336,16 +336,10 @@ def test_bad_input() -> None:
     q, v, a = motion(model, 50)
     tau = torques(model, q, v, a)
     for wrong, text in (
-        ({"q": q[:, :2]}, "q: expected shape"),
         ({"tau": tau[:40]}, "as many of each"),
-        ({"tau": tau[0], "q": q[0], "v": v[0], "a": a[0]}, "one row per sample"),
         ({"a": np.where(a == a[3, 1], np.nan, a)}, "nan"),
-        ({"weights": np.ones(2)}, "weights: expected shape"),
         ({"weights": -np.ones(3)}, "at least 0"),
-        ({"weights": np.full(3, np.inf)}, "finite"),
         ({"prior": "entropic"}, "physical=True"),
-        ({"prior": "bayes", "physical": True}, "euclidean"),
-        ({"physical": 1}, "True or False"),
         ({"prior_weight": 0.0}, "above 0"),
     ):
         with pytest.raises(InputError, match=text):
@@ -400,10 +394,8 @@ def test_bad_excitation() -> None:
     model = mb.catalog.pendulum()
     for wrong, text in (
         ({"duration": 0.0}, "duration"),
-        ({"harmonics": 0}, "harmonics"),
         ({"rate": 1.0, "duration": 1.0}, "rate"),
         ({"margin": 1.0}, "margin"),
-        ({"seed": "x"}, "seed"),
     ):
         with pytest.raises(InputError, match=text):
             mb.excitation(model, **wrong)
