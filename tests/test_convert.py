@@ -82,7 +82,7 @@ def test_a_number_of_a_joint_is_read_back_or_named(to: str, tmp_path: Path) -> N
     numbers = [{name: 2.0} for name in each] + [{"effort_limit": 0.0}, {"upper": 1.5, "lower": -1.0}]
     numbers += [{"friction": 1.0, "stiction": 2.0}, {"friction": 1.0, "stiction": 2.0, "stribeck_velocity": 0.1}]
     numbers += [{"friction": 1.0, "stiction": 1.0}]
-    kinds = ("revolute", 1), ("continuous", 1), ("prismatic", 1), ("planar", 3), ("free", 6)
+    kinds = ("revolute", 1), ("prismatic", 1), ("planar", 3), ("free", 6)
     for (kind, n), given in itertools.product(kinds, numbers):
         b = mb.ModelBuilder("one")
         b.add_body("body", mass=1.0, com=(0.1, 0.2, 0.3), inertia=(0.1, 0.2, 0.25))

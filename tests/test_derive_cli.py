@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from functools import cache
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from mbkit.lagrangian.summary import SystemSummary, python_code, with_plain_turn
 from mbkit.load.loader import find
 
 
+@cache
 def derive(*arguments, status=0):
     out = CliRunner().invoke(cli, ["derive", *map(str, arguments)])
     assert out.exit_code == status, out.output
@@ -48,7 +50,6 @@ def test_the_name_of_a_slider_crank_means_one_system():
     # Which system, its zero and its direction.
     for said in ("massless crank and rod", "dead centre", "farthest", "counterclockwise", "mbkit.catalog:slider_crank"):
         assert said in out.stderr
-    assert derive("mbkit.lagrangian.systems:slider_crank").stdout == out.stdout
     loop = derive("mbkit.catalog:slider_crank")
     assert "coordinates θ, φ, x" in loop.stdout
     assert "m₃ ẍ = -λ₁" in loop.stdout

@@ -65,8 +65,8 @@ def require_same(batch: Any, alone: list, tolerance: float = 1e-9) -> None:
 def test_members_change_phases_at_their_own_times(method: str, seed: int) -> None:
     """With a force for each step of each, kept now and then, and a last step that is shorter."""
     model = rubbed(seed, 4, SINGLE)
-    q, v, tau = mostly_at_rest(model, 9, seed)
-    rows = tau[:, None] * np.random.default_rng(seed).uniform(0, 1.5, (9, STEPS, 1)).round()
+    q, v, tau = mostly_at_rest(model, 6, seed)
+    rows = tau[:, None] * np.random.default_rng(seed).uniform(0, 1.5, (6, STEPS, 1)).round()
     dyn = mb.dynamics(model, "lagrangian")
     require_same(*together_and_alone(dyn, q, v, method, {"torque": rows}, save=[0.0, 7 * STEP, 50 * STEP, DURATION]))
 
@@ -125,12 +125,12 @@ def test_what_diverges_ends_alone() -> None:
 def test_steps_of_a_batch_are_those_of_its_states() -> None:
     """In one call, with what ends its phase within the step, under wrenches and at a time of their own."""
     model = pushed_in_time(rubbed(8, 3, SINGLE))
-    q, v, tau = mostly_at_rest(model, 40)
+    q, v, tau = mostly_at_rest(model, 12)
     v *= 0.01
     dyn = mb.dynamics(model, "lagrangian")
-    wrenches = {model.bodies[-1].name: np.random.default_rng(2).uniform(-5, 5, (40, 6))}
+    wrenches = {model.bodies[-1].name: np.random.default_rng(2).uniform(-5, 5, (12, 6))}
     batch = dyn.step(q, v, tau, 1e-2, wrenches=wrenches, t=0.2)
-    for i in range(40):
+    for i in range(12):
         own = {name: w[i] for name, w in wrenches.items()}
         for together, alone in zip(batch, dyn.step(q[i], v[i], tau[i], 1e-2, wrenches=own, t=0.2), strict=True):
             assert off(together[i], alone) < 1e-12

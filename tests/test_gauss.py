@@ -128,7 +128,7 @@ def test_compiled_steps_are_those_of_python(seed: int, n: int) -> None:
     model = random_tree(seed, n, ("ball", "prismatic") if n == 2 else ("free", "ball", "revolute", "prismatic")[seed:])
     q, v = model.random_state(np.random.default_rng(seed), 3)
     rows = np.random.default_rng(seed).standard_normal((3, 10, model.nv))
-    for method in GAUSS:
+    for method in GAUSS if n > 2 else GAUSS[:1]:
         compiled, interpreted = both(model, method, q, v, torque=rows)
         for x, y in ((compiled.q, interpreted.q), (compiled.v, interpreted.v)):
             # Ten steps of rounding, which inverse and forward dynamics have their own of.

@@ -77,7 +77,7 @@ def torques(model: Model, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.nda
     return mb.dynamics(model, "pinocchio").inverse_dynamics(q, v, a)
 
 
-@pytest.mark.thorough("pinocchio-ur5", "pinocchio-panda", "mujoco-ur5", "lagrangian-panda")
+@pytest.mark.thorough("pinocchio-ur5", "pinocchio-panda", "mujoco-ur5", "lagrangian-panda", "mujoco-panda")
 @pytest.mark.parametrize("name", ["ur5", "panda"])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_exact_from_exact_torques(name: str, engine: str) -> None:
@@ -99,7 +99,7 @@ def test_errors_are_within_three_of_the_deviations_told(name: str) -> None:
     model, at, tau = exact(name)
     size = np.sqrt((tau**2).mean(axis=0)) * np.geomspace(0.003, 0.03, model.nv)
     true, rng, off = model.base_parameters().values, np.random.default_rng(0), []
-    for _ in range(12):
+    for _ in range(8):
         found = mb.identify(model, *at, tau + size * rng.standard_normal(tau.shape))
         off.append((values(found) - true) / deviations(found))
         noise = np.array([r.noise for r in found.residuals])
