@@ -143,6 +143,7 @@ def test_a_heavy_end_costs_no_digits(name):
     assert errors(dyn.forward_dynamics(q, v, np.zeros_like(v)), exact).max() < 1e5 * EPS
 
 
+@pytest.mark.thorough("1")
 @pytest.mark.parametrize("seed", [0, 1])
 def test_an_error_is_what_the_descriptions_own_rounding_makes(seed):
     """On random trees of any axes: no double arithmetic can know more of a system whose numbers are doubles."""

@@ -46,7 +46,7 @@ def sample(model: mb.model.Model, n: int = 3, seed: int = 0) -> dict[str, np.nda
     return dict(zip("qvat", states(model, n, seed), strict=True))
 
 
-@pytest.mark.thorough("3", "4", "5", "6", "7")
+@pytest.mark.thorough("2", "3", "4", "5", "6", "7")
 @pytest.mark.parametrize("seed", range(8))
 def test_every_term_is_that_of_the_energies(seed):
     model = model_of(seed)

@@ -221,7 +221,7 @@ def loose(kind: str, gravity=(0.3, 0.2, -9.81)) -> mb.Model:
     return b.build(nonphysical="warn")
 
 
-@pytest.mark.thorough("revolute", "cylindrical", "frame")
+@pytest.mark.thorough("revolute", "cylindrical", "frame", "universal", "distance")
 @pytest.mark.parametrize("kind", LOOP_KINDS)
 def test_a_body_that_a_loop_holds_begins_to_move_as_newton_and_euler_say(kind):
     model = loose(kind)
@@ -246,7 +246,7 @@ def test_a_body_that_a_loop_holds_begins_to_move_as_newton_and_euler_say(kind):
     assert a == pytest.approx(expected[[0, 1, 2, 5, 4, 3]], abs=1e-12)
 
 
-@pytest.mark.thorough("universal", "prismatic", "point")
+@pytest.mark.thorough("universal", "prismatic", "point", "revolute")
 @pytest.mark.parametrize("kind", LOOP_KINDS)
 def test_every_kind_of_loop_has_the_rows_and_accelerations_of_the_engine(kind):
     model = loose(kind)

@@ -236,7 +236,7 @@ METHODS = {
 
 
 # The others call the same functions either way.
-@pytest.mark.thorough(every=3)
+@pytest.mark.thorough(every=5)
 @pytest.mark.parametrize(
     ("method", "compiled"),
     [(x, False) for x in METHODS]

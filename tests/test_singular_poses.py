@@ -480,7 +480,7 @@ def test_a_single_step_sees_a_pose_that_both_ends_are_as_far_from(compiled, meth
             assert np.abs(v - rate).max() < 1e2 * close
 
 
-@pytest.mark.thorough(every=9)
+@pytest.mark.thorough(every=17)
 @pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("steps", [1, 2, 3, 7])
 @pytest.mark.parametrize(
@@ -515,6 +515,7 @@ def test_a_run_tells_its_poses_whatever_it_saves(compiled, method) -> None:
         assert float(told.split("t = ")[1].split(" ")[0]) == pytest.approx(when, abs=2e-2 * dt)
 
 
+@pytest.mark.thorough(every=2)
 @pytest.mark.parametrize("n", [1, 2])
 @pytest.mark.parametrize("start", [(0.82, -2.76), (-2.75, -5.8), (1.88, 4.95)])
 def test_poses_are_told_however_long_the_steps_are(n, start) -> None:

@@ -90,7 +90,7 @@ def test_runs_and_steps_begin_where_one_joint_holds_back(engine: str, method: st
         assert dyn.step(still, still, PULL, 0.01, method)[1] == pytest.approx([0, -0.02 / 0.21], rel=1e-12)
 
 
-@pytest.mark.thorough("1", "2", "4")
+@pytest.mark.thorough("1", "2", "4", "5")
 @pytest.mark.parametrize("seed", range(6))
 def test_accelerations_at_rest_are_those_of_a_consistent_pattern(seed: int) -> None:
     """Each of 3,600 states is held against all 3^n patterns."""

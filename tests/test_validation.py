@@ -18,6 +18,7 @@ STAMP = {"date", "versions", "processor", "simd", "code"}
 BY_HAND = {"gpu.json": {"left out", "remarks"}, "derivation.json": {"python"}}
 
 
+@pytest.mark.thorough("bench_terms", "friction", "flexible", "importers", "identification", "auto")
 @pytest.mark.parametrize("name", PARTS)
 def test_a_part_runs_and_writes_what_is_kept(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

@@ -487,10 +487,10 @@ def test_a_wheel_in_a_plane_has_the_rows_that_the_plane_leaves() -> None:
         mb.lagrangian.from_model(model)
 
 
-@pytest.mark.thorough("slider_crank-appell", "slider_crank-boltzmann_hamel")
+@pytest.mark.thorough("slider_crank-maggi", "slider_crank-boltzmann_hamel")
 @pytest.mark.parametrize(
     ("make", "way"),
-    [(mb.catalog.rolling_disc, "maggi"), (mb.catalog.slider_crank, "appell"), (mb.catalog.slider_crank, WAYS[1])],
+    [(mb.catalog.rolling_disc, "appell"), (mb.catalog.slider_crank, "maggi"), (mb.catalog.slider_crank, WAYS[1])],
 )
 def test_holonomic_constraints_are_eliminated_by_their_rates(make, way) -> None:
     """The height of a disc and the loop of a crank go the way of the rows that roll."""

@@ -102,7 +102,7 @@ def written(system: Callable[[], Any], h: float) -> Trajectory:
     return simulate(system().dynamics(), [1.0], [0.5], 0.5, dt=h / 10)
 
 
-@pytest.mark.thorough("<lambda>1")
+@pytest.mark.thorough("<lambda>1", "<lambda>3", "<lambda>6")
 @pytest.mark.parametrize(
     "run",
     [
