@@ -15,6 +15,7 @@ import os
 import re
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -93,17 +94,28 @@ def deciding(tree: ast.Module) -> set[str]:
     return out
 
 
+def words(line: str) -> set[str]:
+    """Return the words of a line."""
+    return set(re.findall(r"\w+", line))
+
+
 def constants(package: Path = TOP / "mbkit", tests: Path = TOP / "tests") -> list[Constant]:
     """Return the numeric constants of a package, by file."""
     trees = {str(p.relative_to(package)): ast.parse(p.read_text()) for p in sorted(package.rglob("*.py"))}
     decides = {file: deciding(tree) for file, tree in trees.items()}
     anywhere = set().union(*decides.values())
-    words = {p.name: set(re.findall(r"\w+", p.read_text())) for p in sorted(tests.glob("*.py"))}
+    lines = {p.name: [*map(words, p.read_text().splitlines())] for p in sorted(tests.glob("*.py"))}
+    known = numbers(trees)
+    times = Counter(name for _, name in known)
     out = []
-    for (file, name), value in numbers(trees).items():
+    for (file, name), value in known.items():
         # One of a private name decides in its own module.
         threshold = name in (decides[file] if name.startswith("_") else anywhere)
-        out.append(Constant(file, name, value, threshold, tuple(t for t, found in words.items() if name in found)))
+        # A name that several modules have is that of the module on its line.
+        named = {name} | ({Path(file).stem} if times[name] > 1 else set())
+        out.append(
+            Constant(file, name, value, threshold, tuple(t for t, of in lines.items() if any(map(named.issubset, of))))
+        )
     return out
 
 
