@@ -8,10 +8,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace as Stub
 from typing import Any
 
+import mpmath
 import numpy as np
 import pytest
 import sympy as sp
@@ -25,21 +27,25 @@ from mbkit.derivation import constraints
 from mbkit.derivation.steps import onto_constraints
 from mbkit.engines.applications import random_states
 from mbkit.engines.constrained import singular_pose
-from mbkit.errors import InputError, MbkitError, ModelError, nearest
+from mbkit.engines.constraint_manifold import Manifold
+from mbkit.engines.elements import jumps
+from mbkit.errors import InputError, MbkitError, ModelError, NumericalError, nearest
 from mbkit.lagrangian import printer
+from mbkit.lagrangian.continua import integrals, ritz
 from mbkit.lagrangian.continua.beam import clamped_free
 from mbkit.lagrangian.energies import sympy_to_casadi
-from mbkit.lagrangian.trig import simplify
-from mbkit.load import loader, xml_reader
+from mbkit.lagrangian.statics import steady_motion
+from mbkit.lagrangian.trig import shortest_form, simplify
+from mbkit.load import loader, urdf_reader, xml_reader
 from mbkit.methods import METHODS, one_step
 from mbkit.model import base_parameters, manifold, validation
 from mbkit.model.builder import ArgumentReader
-from mbkit.model.elements import beams, motion_laws
+from mbkit.model.elements import beams, editing, motion_laws
 from mbkit.model.quaternions import FLOATS
 from mbkit.show import meshes
-from mbkit.simulate import checks, time_grid
-from mbkit.simulate.solvers import vector_field
-from mbkit.simulate.stiffness_measure import Stiffness
+from mbkit.simulate import checks, stiffness_measure, time_grid
+from mbkit.simulate.solvers import auto, step_attempts, trajectory_record, vector_field
+from mbkit.simulate.solvers.in_phases import moreau, phases
 from mbkit.studies import formatting, lint
 from mbkit.studies.baseline import description, file
 from mbkit.studies.baseline import study as baseline
@@ -47,8 +53,9 @@ from mbkit.studies.baseline.result import BaselineResult
 from mbkit.studies.compare.result import omission_state
 from mbkit.studies.explain import hypotheses
 from mbkit.studies.measurement import Measurement
+from mbkit.studies.stress import measurements
 from mbkit.studies.stress.study import _Row
-from mbkit.studies.work_precision import sweep
+from mbkit.studies.work_precision import result, sweep
 from tests.scenes import chain, hinge, slider
 
 
@@ -162,7 +169,53 @@ def long_name(size: int) -> bool:
     return not reader.faults
 
 
+def few_joints(count: int) -> bool:
+    reader = xml_reader.Reader.__new__(xml_reader.Reader)
+    reader.faults = []
+    names = [f"l{k}" for k in range(count + 1)]
+    joints: Any = [Stub(name=f"j{k}", parent=a, child=b, kind="free") for k, (a, b) in enumerate(pairwise(names))]
+    urdf_reader._check_tree(names, joints, False, reader)
+    return not reader.faults
+
+
+def materials(count: int) -> bool:
+    text = "".join(f"usemtl m{k}\n" for k in range(count))
+    try:
+        meshes._wavefront(text, Path(), lambda _: None)
+    except ValueError as error:
+        return "materials" not in str(error)
+    return True
+
+
 # Expressions
+
+
+def readable(terms: int) -> bool:
+    with pytest.MonkeyPatch.context() as there:
+        there.setattr(simplify, "shortest_form", lambda *_, **__: sp.Integer(1))
+        writer = Stub(_back=lambda x: x, _decimals=None)
+        return accepts(simplify._Reading._written, writer, Stub(terms=range(terms)))
+
+
+def combined(terms: int) -> bool:
+    writer = Stub(_known={1: 1}, sum=Stub(terms=range(terms)), _over_one=lambda *_: sp.Integer(1))
+    return bool(simplify._Reading.over_one_denominator(writer))
+
+
+def split_off(angles: int) -> bool:
+    key = (None, (1,) * angles)
+    return bool(shortest_form._split_off(Stub(space=Stub(angles=range(angles)), terms={key: 1})))
+
+
+def is_definite(part: float) -> bool:
+    with mpmath.workdps(200):
+        return ritz._cholesky(mpmath.matrix([[1, 1], [1, 1 + mpmath.mpf(10) ** part]])) is not None
+
+
+def turns_about_two_axes(apart: float) -> bool:
+    M = np.array([[1.0, 1 - 2 * apart], [1 - 2 * apart, 1.0]])
+    reduced: Any = Stub(cyclic=[Stub(name="a"), Stub(name="b")], system=Stub(name="s"))
+    return accepts(steady_motion._refuse_pole, M[None], reduced, np.zeros(1))
 
 
 def condition_of_rates(condition: float) -> bool:
@@ -254,7 +307,7 @@ def has_closed(of: tuple[int, float]) -> bool:
 
 def projected(residual: float) -> bool:
     _, _, moved, _ = onto_constraints.projection(equations(two_carts()))([0, residual], [0, 0], [0, 0])
-    return bool(np.any(moved))
+    return bool(np.array(moved).any())
 
 
 def far_in_one(aside: float) -> bool:
@@ -293,6 +346,62 @@ def drawn_anywhere(k: int) -> bool:
     return (draws(k) or [])[-1:] == [manifold.random_state(model, rng, None)[0] for _ in range(k + 1)][-1:]
 
 
+def compiles_moreau(responses: int) -> bool:
+    model = Stub(effects={"jump"}, constrained=True, nv=responses)
+    dyn = Stub(_derived=True, _compiles_steps=True, model=model, _jumps=Stub(law=Stub(which=[0])))
+    return moreau._compiles(Stub(dyn=dyn, torque=Stub(callable=False)))
+
+
+def compiles_rounds(joints: int) -> bool:
+    dyn = Stub(_derived=True, _compiles_steps=True, _code=lambda *_, **__: None)
+    return jumps.Jumps._rounds(Stub(law=Stub(which=range(joints))), dyn) is not None
+
+
+def blames_the_engine(size: float) -> bool:
+    def refuse(*_: Any) -> None:
+        raise NumericalError("the engine's reason")
+
+    field = object.__new__(vector_field.Field)
+    field._space, field._timed, field._forward, field.evaluations = None, False, refuse, 0
+    with pytest.raises(vector_field.DivergenceError) as caught:
+        field(0.0, np.array([size]), np.zeros(1), np.zeros(1))
+    return "engine" in str(caught.value)
+
+
+def ends_at(power: float) -> bool:
+    """Return whether damped Newton leaves 1, from which it reaches zero of |q|^power by short steps alone."""
+    return bool(closest(power)[0] != 1.0)
+
+
+def closest(power: float) -> np.ndarray:
+    def rows(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        size = abs(q[0]) ** power
+        return np.array([size]), np.array([[power * size / q[0]]])
+
+    return manifold.closest_configuration(SPRING, np.ones(1), np.eye(1), rows)[0]
+
+
+def sampled(place: float) -> bool:
+    arm = {"kind": "prismatic", "mass": 1.0, "axis": (1, 0, 0)}
+    model = chain({"axis": (0, 0, 1)}, arm).build()
+    return bool(np.isclose(validation.sample_mass_matrix(model, np.array([0.0, place]))[0, 0], place**2))
+
+
+def crawls(steps: int, covered: float) -> bool:
+    record: Any = Stub(steps=steps, rejected=0, _look=(0, 0.0), reached=covered, problem=Stub(duration=1.0))
+    record.stop = lambda *_: None
+    return trajectory_record.TrajectoryRecord.crawls(record)
+
+
+def stops_the_other(speed: float) -> bool:
+    rests, rubs = np.array([True, False]), np.array([False, False])
+    return bool(phases.stopped(np.ones((2, 1)), np.array([speed, 1.0]), rests, rubs)[1] != 1.0)
+
+
+def has_eigenvalues(rows: int) -> bool:
+    return len(stiffness_measure.stiffness_of(-np.eye(rows), np.inf, exact=True).eigenvalues) > 0
+
+
 # Studies
 
 
@@ -314,6 +423,15 @@ def turned(ratio: float) -> bool:
     return sweep.Curve.turn.fget(Stub(points=cells)) is not None
 
 
+def preparation(seconds: float) -> float:
+    return measurements.Limits.preparation.fget(Stub(seconds=seconds))
+
+
+def unexpected(order: float) -> bool:
+    curve = Stub(points=(), order=order, expected=0.0)
+    return result.curve_lines(Stub(front=(), floor=0.0, curves=[curve]))[0][2]
+
+
 def stops_after(failures: int) -> bool:
     row = _Row("e", "m", "dt", None)
     for k in range(failures):
@@ -322,10 +440,10 @@ def stops_after(failures: int) -> bool:
 
 
 def changes_shown(count: int) -> bool:
-    result: Any = Stub(
+    checked: Any = Stub(
         changes=[Stub(text="t")] * count, effect="", moved=(), versions=(), processors=("", ""), skipped=(), notes=()
     )
-    return ("description", "and 1 more") in list(BaselineResult.lines(result))
+    return ("description", "and 1 more") in list(BaselineResult.lines(checked))
 
 
 def rollout_steps(steps: int) -> bool:
@@ -372,8 +490,24 @@ DECIDES: dict[str, tuple[Callable[[Any], object], Any, Any]] = {
         0.05,
         0.2,
     ),
+    "engines.constraint_manifold:AT_POSE": (
+        lambda x: Manifold.at_pose(Stub(jacobian=lambda _: np.diag([1.0, x])), None),
+        5e-9,
+        5e-8,
+    ),
+    "engines.elements.jumps:_MAX_COMPILED": (compiles_rounds, 18, 19),
     "errors:_MAX_FAULTS": (lambda x: ".faults holds all" in str(ModelError("m", ["f"] * x)), 100, 101),
     "errors:_LONGEST_NAME": (lambda x: bool(nearest("x" * x, ["x" * x + "y"])), 200, 201),
+    "lagrangian.continua.integrals:_INTEGRAL_ERROR_RATIO": (
+        lambda x: integrals.number(sp.Rational(1, 3) + sp.Rational(x)).is_Float,
+        "1e-23",
+        "1e-22",
+    ),
+    "lagrangian.continua.ritz:_ZERO_PIVOT_RATIO": (is_definite, -100.5, -99.5),
+    "lagrangian.statics.steady_motion:_SINGULAR_CONDITION": (turns_about_two_axes, 5e-6, 5e-5),
+    "lagrangian.trig.shortest_form:_MAX_PRODUCT_ANGLES": (split_off, 4, 5),
+    "lagrangian.trig.simplify:MAX_READABLE_TERMS": (readable, 400, 401),
+    "lagrangian.trig.simplify:MAX_COMBINED_TERMS": (combined, 60, 61),
     "lagrangian.continua.beam:MAX_MODES": (lambda x: accepts(clamped_free, x, sp.Symbol("x"), 1), 20, 21),
     "lagrangian.energies.sympy_to_casadi:MAX_SHOWN_LETTERS": (
         lambda x: sympy_to_casadi._short("x" * x).endswith("..."),
@@ -387,6 +521,7 @@ DECIDES: dict[str, tuple[Callable[[Any], object], Any, Any]] = {
     "lagrangian.trig.simplify:_MAX_EXPONENT": (power_is_one, 12, 13),
     "lagrangian.trig.simplify:_MAX_TIDIED_OPERATIONS": (tidied, 145, 155),
     "load.loader:_MAX_TOML_BYTES": (toml, 1_000_000, 1_000_001),
+    "load.urdf_reader:_MAX_JOINTS": (few_joints, 2000, 2001),
     "load.xml_reader:MAX_DEPTH": (lambda x: accepts(xml_reader.parse, b"<a>" * x + b"</a>" * x, "x"), 250, 251),
     "load.xml_reader:_MAX_LISTED_FILES": (listed, 10, 11),
     "load.xml_reader:MAX_NAME_LENGTH": (long_name, 1000, 1001),
@@ -415,6 +550,8 @@ DECIDES: dict[str, tuple[Callable[[Any], object], Any, Any]] = {
     ),
     "model.elements.motion_laws:MAX_KNOTS": (few_knots, 2000, 2001),
     "model.manifold:NEAR_UNIT": (quaternion, 4e-10, 4e-9),
+    "model.manifold:_LEAST_STEP_PART": (ends_at, 2e-7, 2e-6),
+    "model.manifold:_MAX_SEARCH_STEPS": (lambda x: abs(closest(x)[0]) < 1e-9, 0.55, 0.9),
     "model.manifold:_COMMON_SIZE": (lambda x: manifold.magnitude(np.array([x])) > 1, 9.0, 11.0),
     "_check:TWO_TURNS": (lambda x: warns(_check.hint_at_degrees, "q", x), 10.0, 15.0),
     "model.model:_MAX_TURN_IN_A_STEP": (
@@ -422,7 +559,13 @@ DECIDES: dict[str, tuple[Callable[[Any], object], Any, Any]] = {
         0.5,
         2.0,
     ),
-    "model.validation:_MAX_NAMES": (names_bodies, 30, 50),
+    "model.validation:MAX_LISTED": (names_bodies, 30, 50),
+    "model.elements.editing:_MAX_NOTED_NUMBERS": (
+        lambda x: list(editing._changes(Stub(a=np.zeros(x)), {"a": np.ones(x)}, set(), set())) == ["a"],
+        3,
+        4,
+    ),
+    "model.validation:_MAX_SAMPLED_COORDINATE": (sampled, 5e5, 5e6),
     "model.validation:_MAX_VELOCITIES": (too_many, 5000, 5001),
     "model.validation:_MIN_MASS_OR_MOMENT": (
         lambda x: bool(validation.scale_doubts(slider(mass=x).build())),
@@ -430,6 +573,7 @@ DECIDES: dict[str, tuple[Callable[[Any], object], Any, Any]] = {
         5e-14,
     ),
     "model.validation:_MAX_SIZE_RATIO": (lambda x: bool(validation.scale_doubts(small_wheel(x))), 5e-12, 5e-11),
+    "show.meshes:_MAX_MATERIALS": (materials, 4999, 5000),
     "show.meshes:_MIN_CLUSTERED_TRIANGLES": (lambda x: len(clustered(x)) < x, 140, 160),
     "simulate.checks:_MAX_ROUNDING": (
         lambda x: any(checks.condition([np.array([[1.0, 1 - x], [1 - x, 1.0]])])),
@@ -454,10 +598,37 @@ DECIDES: dict[str, tuple[Callable[[Any], object], Any, Any]] = {
     "simulate.checks:_MAX_HALVING_DIFFERENCE": (rushes, 2.0, 3.0),
     "simulate.checks:_MAX_EIGENVALUE_RATIO": (moves_mass, 5e-8, 5e-7),
     "simulate.trajectory:_MAX_GAP": (half_step_differs, 5e-3, 5e-2),
+    "simulate.solvers.auto:MIN_RTOL": (
+        lambda x: auto.loosest("rk853", checks.Tolerances(2e-13, 1.0)).rtol > x,
+        7e-14,
+        1.5e-13,
+    ),
+    "simulate.solvers.auto:_RK853_SHARE": (
+        lambda x: auto.loosest("rk853", checks.Tolerances(1e-6, 1.0)).rtol > x,
+        5e-8,
+        2e-7,
+    ),
+    "simulate.solvers.in_phases.moreau:_MAX_RESPONSES": (compiles_moreau, 200, 201),
+    "simulate.solvers.in_phases.phases:POSE_ROUNDING": (lambda x: phases.slow(np.ones(1))[0] > x, 5e-10, 5e-9),
+    "simulate.solvers.in_phases.phases:_FADED": (
+        lambda x: phases.fades(np.zeros((1, 1)), np.ones(1), np.full(1, x))[0],
+        5e-8,
+        5e-7,
+    ),
+    "simulate.solvers.in_phases.phases:_LEFT": (stops_the_other, 5e-4, 5e-3),
+    "simulate.solvers.step_attempts:LOOSEST": (
+        lambda x: step_attempts.RungeKuttaAttempts._reach.fget(Stub(_tolerances=checks.Tolerances(x, x), grows=8)) > 1,
+        5e-11,
+        5e-10,
+    ),
+    "simulate.solvers.trajectory_record:_ATTEMPTS_PER_LOOK": (lambda x: crawls(x, 0.0), 19_999, 20_000),
+    "simulate.solvers.trajectory_record:_MIN_SHARE_COVERED": (lambda x: crawls(10**6, x), 5e-7, 5e-6),
+    "simulate.solvers.vector_field:BLAMELESS": (blames_the_engine, 5e49, 5e50),
+    "simulate.stiffness_measure:_MAX_SMALL_ROWS": (has_eigenvalues, 20, 21),
     "simulate.time_grid:MAX_NUMBERS": (lambda x: accepts(time_grid.check_room, x, 2), 2**29, 2**29 + 1),
     "simulate.solvers.vector_field:BOUND": (lambda x: bool(vector_field.is_bounded(np.array([x]))), 5e99, 5e100),
     "simulate.stiffness_measure:_MIN_GROWTH_SHARE": (
-        lambda x: Stiffness(np.array([complex(x, 1.0)]), 1.0).stable > 0,
+        lambda x: stiffness_measure.Stiffness(np.array([complex(x, 1.0)]), 1.0).stable > 0,
         0.05,
         0.2,
     ),
@@ -490,6 +661,19 @@ DECIDES: dict[str, tuple[Callable[[Any], object], Any, Any]] = {
     "studies.lint.checks:MIN_COPIES": (copied, 2, 3),
     "studies.measurement:GROSS": (lambda x: Measurement(1.0, error=x).outcome(1e-6), 5e-3, 5e-2),
     "studies.stress.study:_MAX_FAILURES_IN_A_ROW": (stops_after, 1, 2),
+    "studies.stress.measurements:_MIN_PREPARATION_SECONDS": (lambda x: preparation(0.0) > x, 5.0, 7.0),
+    "studies.stress.measurements:_PREPARATION_PER_RUN_TIME": (lambda x: preparation(10.0) > x, 140.0, 160.0),
+    "studies.work_precision.result:MAX_ORDER_ERROR": (unexpected, 0.15, 0.25),
+    "studies.work_precision.result:MAX_USEFUL_ERROR": (
+        lambda x: result.front_names(Stub(front=[(Stub(name="a"), Stub(error=x))])),
+        0.05,
+        0.2,
+    ),
+    "studies.work_precision.sweep:_COARSEST_STEP_SECONDS": (
+        lambda x: sweep._steps(METHODS["rk4"], 10.0)[0] > x,
+        0.04,
+        0.06,
+    ),
     "studies.work_precision.sweep:_MAX_ERROR_PER_MOTION": (
         lambda x: points([x, x / 16, x / 256, x / 4096], motion=1.0),
         0.02,
