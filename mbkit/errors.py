@@ -44,6 +44,8 @@ __all__ = [
 # A message is for reading: this many faults of a description, and so many characters of each.
 _MAX_FAULTS: Final = 100
 _MAX_CHARACTERS: Final = 2000
+# Names that a message lists whole.
+MAX_LISTED: Final = 40
 # Longer names are not compared with others: the comparison takes the square of the length.
 _LONGEST_NAME: Final = 200
 
@@ -121,7 +123,7 @@ class UnknownNameError(MbkitError, LookupError):
         listed = f"there are: {', '.join(self.known) or 'none'}"
         if near:
             advice = f"did you mean {' or '.join(repr(n) for n in near)}?" + (f" {listed}" if every else "")
-        elif every or len(self.known) <= 40:
+        elif every or len(self.known) <= MAX_LISTED:
             advice = listed
         else:
             advice = f"none of the {len(self.known)} known names is near"

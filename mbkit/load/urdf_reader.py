@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from mbkit import spatial
 from mbkit._check import EPS, TWO_TURNS, Array, by_key
 from mbkit._reproducible import turned
-from mbkit.errors import ModelError, Suggestions
+from mbkit.errors import MAX_LISTED, ModelError, Suggestions
 from mbkit.load import xml_reader
 from mbkit.load.mjcf_attributes import z_to
 from mbkit.load.xml_reader import Element, Reader, element_text, misspelt, reserved, unused
@@ -35,7 +35,6 @@ _MAX_JOINTS: Final = 2000
 BASE_JOINT: Final = "root_joint"
 # Pinocchio's parser takes this for no limit.
 _OPEN: Final = "1.7976931348623157e308"
-_MAX_LISTED: Final = 40
 _KINDS: Final = {k: k for k in ("fixed", "revolute", "continuous", "prismatic", "planar")} | {"floating": "free"}
 #: Numbers of <dynamics>, which the builder has by the same names.
 DYNAMICS: Final = ("damping", "friction")
@@ -134,7 +133,7 @@ def examine(robot: Element, source: str, *, floating_base: bool, mimic_matters: 
     if read.faults:
         raise ModelError(source, read.faults)
     if lenient and (points := [x.name for x, _ in links if x.mass and x.inertia is not None and not x.inertia.any()]):
-        read.notes.append(f"links of mass without inertia, read as point masses: {listing(points, _MAX_LISTED)}")
+        read.notes.append(f"links of mass without inertia, read as point masses: {listing(points, MAX_LISTED)}")
     return UrdfFile(
         name,
         element_text("robot", {"name": name}, texts),
@@ -466,7 +465,7 @@ def _unread(robot: Element, read: Reader) -> list[str]:
                 elements[child.tag[:40]] += 1
         stack.extend(c for c in reversed(element.children) if c.tag in children)
     return [
-        f"{what}: {listing([f'{n} {tag}' for tag, n in sorted(counts.items())], _MAX_LISTED)}"
+        f"{what}: {listing([f'{n} {tag}' for tag, n in sorted(counts.items())], MAX_LISTED)}"
         for what, counts in (
             ("left out of the file, with every path in it", elements),
             ("attributes that URDF does not define, left out", attributes),

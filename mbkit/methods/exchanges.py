@@ -19,17 +19,17 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mbkit._check import EPS, Array
+from mbkit._check import EPS, TYPED, Array
 from mbkit.model.parts import ROUNDING
 
+#: Rounds of exchanges in one call of machine code: as many as proximal points take.
+ROUNDS: Final = 2
 #: Rounds of exchanges that may leave as many conditions failing; then conditions are exchanged one by one.
 PATIENCE: Final = 3
 #: Part of the forces that their sums lose to rounding.
 FORCE_ROUNDING: Final = 64 * EPS
 #: Addition to the diagonal of a singular A: far from its own rounding and from what is not rounding.
 PROXIMAL_SHIFT: Final = 2.0**-32
-#: Joints whose power differs by less than this part let go together, as rounding does not break a symmetry.
-_POWER_TIE_RATIO: Final = 1e-9
 
 
 class Operations(NamedTuple):
@@ -129,7 +129,8 @@ def exchange(o: Operations, p: Problem, s: Signs, n: int) -> tuple[Signs, Any, A
     moves = s.side != 0 if p.shift is None else s.side * rate < -least
     falls = moves * (o.size(forces) > p.less) * settled * (1 - near)
     power = o.choose(falls, o.size(rate) * p.bound, 0.0)
-    first = falls * (power >= (1 - _POWER_TIE_RATIO) * o.largest(power))
+    # Joints whose power differs by less let go together, as rounding does not break a symmetry.
+    first = falls * (power >= (1 - TYPED) * o.largest(power))
     # A joint that is known to leave may be held by what the others do then.
     again = o.largest(first)
     signs = Signs(

@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 import numpy as np
 
 from mbkit._check import EPS, PRINTED, Array, by_key
-from mbkit.errors import InputError, ModelError, Suggestions, did_you_mean
+from mbkit.errors import MAX_LISTED, InputError, ModelError, Suggestions, did_you_mean
 from mbkit.model import manifold
 from mbkit.model.description import Description
 from mbkit.model.elements.forces import force_faults
@@ -31,8 +31,6 @@ from mbkit.spatial import skew
 
 # Fields that add to T along a joint's velocity.
 _TURNING: Final = " or ".join(Joint.adding_to("T"))
-# Names in a message.
-_MAX_NAMES: Final = 40
 # M of so many velocities has 200 MB.
 _MAX_VELOCITIES: Final = 5000
 
@@ -68,7 +66,7 @@ def structure_faults(description: Description) -> Iterator[str]:
         for name in names:
             if name not in known:
                 near = suggestions.near(name, known)
-                few = f"; there are: {', '.join(sorted(known))}" if len(known) <= _MAX_NAMES else "; declare it"
+                few = f"; there are: {', '.join(sorted(known))}" if len(known) <= MAX_LISTED else "; declare it"
                 yield f"{item}: unknown {what} {name!r}" + (f"; did you mean {near!r}?" if near else few)
 
     for joint in joints:

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
+from mbkit._check import EPS
 from mbkit._escape import html
 from mbkit.simulate.plotting.style import POINTS, Palette, drawing
 
@@ -32,6 +33,8 @@ _VARIABLES: Final = {
 }
 PAGE_WIDTH_INCHES: Final = 10.4
 PANELS_PER_ROW: Final = 5
+#: Smaller errors are drawn here, where double precision tells nothing, and a logarithm has no zero.
+MIN_DRAWN_ERROR: Final = EPS / 64
 #: Pixels of the smallest letters of a figure, however narrow the window.
 _MIN_LETTER_PIXELS: Final = 10.0
 

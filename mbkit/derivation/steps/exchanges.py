@@ -9,10 +9,7 @@ import casadi as ca
 
 from mbkit.derivation.mass_matrix_solve import solve
 from mbkit.derivation.steps.symbols import choose
-from mbkit.methods.exchanges import Operations, Problem, Signs, exchange
-
-#: Rounds of one call.
-_ROUNDS: Final = 3
+from mbkit.methods.exchanges import ROUNDS, Operations, Problem, Signs, exchange
 
 
 def restricted(A: Any, right: Any, on: Any) -> Any:
@@ -47,6 +44,6 @@ def exchange_rounds(n: int) -> ca.Function:
     state += [ca.SX.sym(name) for name in Signs._fields[4:6]]
     A = ca.reshape(square, n, n)
     problem, signs, out = Problem._make([A, A, *given, None]), Signs._make([*state, ca.SX(n, 1)]), list[Any]()
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         signs, *out = exchange(COLUMNS, problem, signs, n)
     return ca.Function("exchange_rounds", [square, *given, *state], [ca.densify(x) for x in (*signs[:6], *out)])

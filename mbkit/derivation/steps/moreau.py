@@ -25,7 +25,7 @@ from mbkit.derivation.steps.exchanges import COLUMNS
 from mbkit.derivation.steps.fixed import Part, function_of
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, projection, rows_change
 from mbkit.derivation.steps.symbols import SymbolicSpace, choose
-from mbkit.methods.exchanges import FORCE_ROUNDING, PATIENCE, PROXIMAL_SHIFT, Problem, Signs, exchange
+from mbkit.methods.exchanges import FORCE_ROUNDING, PATIENCE, PROXIMAL_SHIFT, ROUNDS, Problem, Signs, exchange
 from mbkit.model.parts import POSE_ROUNDING, RESTING, ROUNDING, STOPPED
 
 
@@ -109,8 +109,6 @@ STATE: Final = ("q", "w", "side", "still", "k", "end", "best", "left", "go")
 #: The same beside constraints: `low` and `high` are the bounds now and `before` is the last proximal point of
 #: `mbkit.methods.exchanges`, `depends` the `dependence` of rows a step ago and `new` is 1 where a step begins.
 HELD_STATE: Final = ("q", "w", "side", "still", "low", "high", "before", "depends", "new", *STATE[4:])
-#: Rounds of exchanges in one attempt: as many as proximal points take.
-_EXCHANGES: Final = 2
 #: `best` beyond every velocity: no candidate yet.
 MANY: Final = 1e9
 
@@ -264,7 +262,7 @@ def _held_parts(own: _Attempt) -> list[Part]:
         low, high = (choose(s["new"], x, y) for x, y in ((-most, s["low"]), (most, s["high"])))
         best, left = (choose(s["new"], x, y) for x, y in ((n + 1.0, s["best"]), (PATIENCE, s["left"])))
         signs = Signs(low, high, ca.SX.zeros(n), s["side"] * on, best, left, s["before"] * (1 - s["new"]))
-        for _ in range(_EXCHANGES):
+        for _ in range(ROUNDS):
             signs, forces, holds, going = exchange(COLUMNS, problem, signs, n)
         return [signs.side, rests, signs.low, signs.high, signs.before, signs.best, signs.left, forces, holds, going]
 

@@ -22,6 +22,7 @@ from typing import Any, Final
 import casadi as ca
 import numpy as np
 
+from mbkit._check import PROBES
 from mbkit.derivation.equations import kept
 from mbkit.derivation.mass_matrix_solve import ConstraintTerms
 from mbkit.derivation.steps.symbols import SymbolicSpace
@@ -35,8 +36,6 @@ _ITERATIONS: Final = 4
 _MAX_ERROR: Final = 1e-16
 #: Largest residual by rounding, relative to the sizes of J and of the state.
 _MAX_RESIDUAL: Final = 4e-16
-#: Number of configurations at which the usual size of a row is found.
-_POSES: Final = 8
 
 
 @kept
@@ -151,7 +150,7 @@ def _largest(equations: Any) -> list[float]:
     diagonal = ca.Function(
         "squares", [equations.q, *extra.values()], [ca.densify(ca.vertcat(*equations.constraint_factors.rows.squares))]
     )
-    poses = random_state(model, np.random.default_rng(0), _POSES)[0]
+    poses = random_state(model, np.random.default_rng(0), PROBES)[0]
     values = np.array([np.array(diagonal(q, *given))[:, 0] for q in poses])
     return [float(x) for x in np.nanmax(values, axis=0)]
 

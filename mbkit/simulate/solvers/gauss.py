@@ -14,7 +14,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
-from mbkit._check import EPS, Array
+from mbkit._check import EPS, ITERATED, Array
 from mbkit.methods.one_step import MAX_NEWTON_ITERATIONS
 from mbkit.methods.tableaus import ImplicitTableau, extrapolation_weights, gauss_legendre
 from mbkit.model.integration_space import Space
@@ -27,9 +27,7 @@ MAX_ITERATIONS: Final = 60
 #: Largest ratio of a correction to the last one with which an iteration goes on. Beyond it plain iteration gives way to
 #: Newton's, and Newton's matrix to a new one.
 _MAX_CONTRACTION: Final = 0.05
-#: Largest correction that is rounding where corrections have stopped shrinking, relative to the velocity, and the
-#: largest such move of the configuration, rad or m.
-_MAX_VELOCITY_ROUNDING: Final = 1e-11
+#: Largest move of the configuration that is rounding where corrections have stopped shrinking, rad or m.
 _MAX_MOVE_ROUNDING: Final = 1e-13
 #: Largest difference of two times that are one, in steps.
 _MAX_TIME_ROUNDING: Final = 1e-9
@@ -167,11 +165,7 @@ class CollocationStep:
             factor = size / last
             rest = size * factor / (1 - factor)
         done = (size <= EPS * speed) | (measurable & (factor < 1) & (rest <= EPS / 4 * speed))
-        done |= (
-            measurable
-            & (factor > 0.5)
-            & ((size <= _MAX_VELOCITY_ROUNDING * speed) | (start.h * size <= _MAX_MOVE_ROUNDING))
-        )
+        done |= measurable & (factor > 0.5) & ((size <= ITERATED * speed) | (start.h * size <= _MAX_MOVE_ROUNDING))
         return done, measurable & ~(factor < _MAX_CONTRACTION)
 
     def _size(self, h: float, rates: Array) -> Array:

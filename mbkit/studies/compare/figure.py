@@ -21,7 +21,7 @@ from mbkit.simulate.plotting.style import (
 )
 from mbkit.studies.compare.terms import Row, by_term
 from mbkit.studies.formatting import error_text, time_text
-from mbkit.studies.svg import PAGE, PAGE_WIDTH_INCHES, PANELS_PER_ROW, page_style, svg
+from mbkit.studies.svg import MIN_DRAWN_ERROR, PAGE, PAGE_WIDTH_INCHES, PANELS_PER_ROW, page_style, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -101,9 +101,6 @@ def shown_error(error: float, least: float) -> float:
 
 # Errors of each term against run times: the price of a digit on each engine.
 
-#: Smaller errors are drawn here, where double precision tells nothing.
-_MIN_DRAWN_ERROR: Final = EPS / 64
-
 
 def term_costs(rows: Sequence[Row], engines: Sequence[str], tolerance: float) -> str:
     """Draw each term's worst relative error over the time of a call, one small panel a term.
@@ -132,7 +129,7 @@ def term_costs(rows: Sequence[Row], engines: Sequence[str], tolerance: float) ->
             ax.axhline(EPS, **level)
             ax.axhline(tolerance, **dashed)
             for row in (r for r in timed if r.term == term):
-                place = [row.ns], [shown_error(row.relative, _MIN_DRAWN_ERROR)]
+                place = [row.ns], [shown_error(row.relative, MIN_DRAWN_ERROR)]
                 spent = time_text(row.ns * 1e-9)
                 text = f"{term}, {row.engine}: worst error {error_text(row.relative)} in {spent}"
                 name_points(ax.plot(*place, **looks[one_line(row.engine, 30)]), [text])
@@ -141,7 +138,7 @@ def term_costs(rows: Sequence[Row], engines: Sequence[str], tolerance: float) ->
             ax.set_title(one_line(term, 28), loc="left", fontsize=9.5, pad=3)
         panels[0].set_xscale("log")
         panels[0].set_yscale("log")
-        times, errors = [r.ns for r in timed], [shown_error(r.relative, _MIN_DRAWN_ERROR) for r in timed]
+        times, errors = [r.ns for r in timed], [shown_error(r.relative, MIN_DRAWN_ERROR) for r in timed]
         panels[0].set_xlim(min(times) / 1.6, max(times) * 1.6)
         panels[0].set_ylim(min(*errors, EPS) / 3, max(*errors, tolerance) * 3)
         for k, ax in enumerate(panels):

@@ -22,7 +22,7 @@ from mbkit.simulate.plotting.style import (
     new_figure,
 )
 from mbkit.studies.measurement import Measurement
-from mbkit.studies.svg import PAGE_WIDTH_INCHES, PANELS_PER_ROW
+from mbkit.studies.svg import MIN_DRAWN_ERROR, PAGE_WIDTH_INCHES, PANELS_PER_ROW
 from mbkit.studies.work_precision.sweep import Curve, pareto_front
 
 if TYPE_CHECKING:
@@ -37,8 +37,6 @@ _Measure = Callable[[Measurement], float]
 _SAME_FORMULA: Final = {m.name: m.own for m in METHODS.values() if m.own}
 #: A run with a larger error, rad or m, is not on the front; with ten times as much it is not drawn.
 MAX_USEFUL_ERROR: Final = 0.1
-_MAX_DRAWN_ERROR: Final = 1.0
-_MIN_DRAWN_ERROR: Final = 1e-17
 
 
 def figure(
@@ -111,8 +109,7 @@ class _Drawing:
     def places(self, curves: Sequence[Curve], measure: _Measure) -> list[_Place]:
         points = ((p.seconds, measure(p), c) for c in curves for p in c.points)
         known = (place for place in points if place[0] > 0 and math.isfinite(place[0]) and math.isfinite(place[1]))
-        # A logarithm has no zero.
-        return [(x, max(y, _MIN_DRAWN_ERROR), c) for x, y, c in known if y <= _MAX_DRAWN_ERROR]
+        return [(x, max(y, MIN_DRAWN_ERROR), c) for x, y, c in known if y <= 10 * MAX_USEFUL_ERROR]
 
     def methods(self) -> dict[str, list[Curve]]:
         """Return the curves of each panel, methods on most engines first."""
