@@ -273,10 +273,13 @@ class KernelSequence:
         """Make the calls from `first` to before `last`, counted over the rounds; other Python threads run meanwhile."""
         self._runner.run(self._address, None, first, last)
 
-    def run_once(self, states: int) -> None:
-        """Make the calls of the first round on the first of their states."""
+    def run_once(self, states: int) -> bool:
+        """Make the calls of the first round on the first of their states; return whether all numbers are finite."""
         self._list[4::_ENTRY_WORDS] = states
+        watch = self._work[: jit.host().width]
+        watch[:] = 0.0
         self.run(0, len(self._calls))
+        return bool(np.dot(watch, watch) == 0.0)
 
 
 @cache

@@ -179,19 +179,18 @@ class _Members:
 
     def _keep(self, rows: Indices, k: Indices, count: Indices, q: Array, v: Array) -> None:
         """Put wanted states into the record: of (m, n + 1) behind k steps each row has so many, and one in front."""
-        record, members, steps = self._record, self.members[rows], self.problem.grid.steps
-        if len(record.kept) > steps:
-            # States behind the end of a phase are written again. Rows that have room for as many are written at once.
-            room = np.minimum(q.shape[1], steps + 1 - k)
-            for n in np.unique(room).tolist():
-                its = np.flatnonzero(room == n)
-                for to, x in ((record.q, q), (record.v, v)):
-                    _windows(to, n)[members[its] * (steps + 1) + k[its]] = x[its, :n].reshape(len(its), -1)
-            return
-        for i, (member, first, n) in enumerate(zip(members.tolist(), k.tolist(), count.tolist(), strict=True)):
-            saved = record.rows(first + 1, first + n)
-            which = record.kept[saved] - first
-            record.q[member, saved], record.v[member, saved] = q[i, which], v[i, which]
+        record, members, steps, n = self._record, self.members[rows], self.problem.grid.steps, q.shape[1]
+        dense = len(record.kept) > steps
+        # States behind the end of a phase are written again. Slices of each row take four times as long.
+        fits: Any = dense & (k + n <= steps + 1)
+        its: Any = slice(None) if fits.all() else np.flatnonzero(fits)
+        for to, x in ((record.q, q), (record.v, v)) if fits.any() else ():
+            _windows(to, n)[members[its] * (steps + 1) + k[its]] = x[its].reshape(-1, n * x.shape[2])
+        for i in np.flatnonzero(~fits).tolist():
+            first, last = int(k[i]) + 1, int(k[i] + count[i])
+            saved = slice(first, last + 1) if dense else record.rows(first, last)
+            which: Any = slice(1, last - first + 2) if dense else record.kept[saved] - first + 1
+            record.q[members[i], saved], record.v[members[i], saved] = q[i, which], v[i, which]
 
     # A block
 
@@ -205,11 +204,8 @@ class _Members:
         if not left.any():
             return rows, left + 1, 1, grid.last
         rows, left = rows[left > 0], left[left > 0]
-        # Steps behind the end of the run take no more time than another block for those who are hindmost.
-        ends = np.sort(left)
-        vain = ends * np.arange(1, len(ends) + 1) - ends.cumsum()
-        most = int(ends[np.searchsorted(vain, _SET_UP[self._compiled(self._phase.dyn)], side="right") - 1])
-        n = min(self._window(len(rows)), most, max(_MOST_STATES // len(rows), _BLOCK))
+        n = min(self._window(len(rows)), _last_but_one(left, _SET_UP[self._compiled(self._phase.dyn)]))
+        n = min(n, max(_MOST_STATES // len(rows), _BLOCK))
         if self._timed:
             # Up to where the next ones stand.
             ahead = left.max() - left[left < left.max()]
@@ -247,7 +243,7 @@ class _Members:
         good = self._good(rows, phase, q, v, margins, limit, start, h)
         rate = float((good < limit).sum() / max(good.sum(), 1))
         # Many that move alike end their phases in every other block.
-        self._ends = max(rate, self._ends[0] / 2), 4 * n
+        self._ends = max(rate, self._ends[0] / 2), max(4 * n, self._ends[1])
         last = np.arange(len(rows)), good
         if phase.still.any() and not (compiled and self.side_by_side):
             # What rests keeps its place and no velocity, to the bit.
@@ -449,11 +445,21 @@ class _Members:
         self.q[rows], self.v[rows] = state[0], v
         # A joint that let go and came to rest at once did not let go.
         after = self.begin(rows, self.times(later), leaving * (moved | pushed)[:, None])
-        members = [self.problem.member(i) for i in self.members[rows].tolist()]
-        at = [*zip(t.tolist(), self.q[rows], self.v[rows], members, strict=True)]
+        which = [None] * len(rows) if self.problem.batch is None else self.members[rows].tolist()
+        at = [*zip(t.tolist(), self.q[rows], self.v[rows], which, strict=True)]
         changes = self.phases.changes(before, after)
         self._record.events += [Hit(name, *at[i]) for i, name in changes if decided[i]]
         return after, decided
+
+
+def _last_but_one(left: Indices, set_up: int) -> int:
+    """Return the length of a block with which, and with another behind it, `left` steps take the least time.
+
+    Trajectories that are at the end go on in vain; a block of its own for the others has a `set_up`.
+    """
+    ends, count = np.sort(left), np.arange(1, len(left) + 1)
+    more = (len(left) - count) * ends[-1] - (left.sum() - ends.cumsum()) + set_up * (ends < ends[-1])
+    return int(ends[np.argmin(ends * count - ends.cumsum() + more)])
 
 
 def _windows(states: Array, n: int) -> Array:
@@ -522,9 +528,8 @@ class _PartOfStep:
         if not self._arrays:
             return None
         self._arrays["dt"][i, 0] = s
-        self._calls.run_once(len(self._rows))
-        out = [self._arrays[name][i] for name in ("margins1", "q1", "v1")]
-        return out[0] if all(np.isfinite(x).all() for x in out) else None
+        finite = self._calls.run_once(len(self._rows))
+        return self._arrays["margins1"][i] if finite else None
 
     def _margins(self, i: Indices, s: Array) -> Array:
         found = self._by_code(i, s)
