@@ -100,6 +100,18 @@ def test_symbols_stand_for_the_numbers_of_the_loop_too():
     assert not from_model(inside).parameters
 
 
+def test_andrews_squeezing_mechanism_is_the_published_one():
+    """At its start; tests/test_published_mechanisms.py follows it to the printed end."""
+    told = published()["andrews_squeezing_mechanism"]
+    lag, zero = from_model(mb.catalog.andrews_squeezer()), np.zeros(7)
+    tau = np.array([told["drive_torque_on_beta"], *np.zeros(6)])
+    assert np.abs(lag.constraint(zero)).max() < 1e-16
+    a, lam = (np.array([float(x) for x in told[n]]) for n in ("qdd0", "lambda0"))
+    assert off(lag.dynamics(options=OWN).forward_dynamics(zero, zero, tau), a) < CLOSE
+    # The test set's multipliers stand on the other side of the equation.
+    assert off(lag.multipliers(zero, zero, tau), -lam) < CLOSE
+
+
 # Andrews' squeezing mechanism: seven bodies, three loops
 
 

@@ -184,6 +184,31 @@ def test_a_motion_that_is_not_determined_is_refused_by_name(engine) -> None:
         mb.simulate(dyn, q, v, 0.1, "rk4")
 
 
+@pytest.mark.parametrize("slow", [1e-5, 1e-10])
+def test_the_slower_of_two_motions_says_its_branch_down_to_rounding(slow) -> None:
+    """Parallelograms without a weight turn evenly; a rate that is rounding beside the other's says no branch."""
+    b, tilt = mb.ModelBuilder("two", gravity=(0, 0, 0)), 0.3
+    end, down = np.array([-math.sin(tilt), 0.0, -math.cos(tilt)]), np.array([0.0, 0.0, -2.0])
+    for k in "12":
+        for name, parent, at, way in (
+            ("a", "world", 0 * end, end),
+            ("b", f"a{k}", end, down),
+            ("c", "world", down, end),
+        ):
+            b.add_body(name + k, mass=1.0, com=way / 2, inertia=(0.1, 0.1, 0.1))
+            b.add_joint(name + k, "continuous", parent=parent, child=name + k, axis=(0, 1, 0), translation=at)
+        b.add_loop(f"pin{k}", "point", body_a=f"b{k}", body_b=f"c{k}", translation_a=down, translation_b=end)
+    dyn = mb.dynamics(b.build(), "lagrangian", compile=False)
+    # All links hang in one line.
+    q, v = np.outer([-tilt, -tilt], [1.0, -1.0, 1.0]).ravel(), np.outer([1.0, slow], [1.0, -1.0, 1.0]).ravel()
+    if slow > 1e-8:
+        run, _ = simulated(dyn, q, v, 0.1, "rk4", dt=1e-3)
+        assert run.q[-1] - q == pytest.approx(0.1 * v, abs=1e-9)
+        return
+    with pytest.raises(NumericalError, match="does not say on which branch"):
+        mb.simulate(dyn, q, v, 0.1, "rk4", dt=1e-3)
+
+
 @pytest.mark.parametrize("speed", [3.0, 3e-4])
 def test_a_velocity_of_five_digits_is_on_its_branch_and_one_of_four_is_not(speed) -> None:
     """However slow it is."""

@@ -291,11 +291,6 @@ def test_a_knife_edge_on_a_slope_rests_across_it() -> None:
     assert abs(rest.multipliers[0]) == pytest.approx(0.7 * 9.81 * np.sin(0.4), rel=CLOSE)
 
 
-@pytest.mark.thorough
-def test_engines_are_compared_on_a_sleigh() -> None:
-    assert mb.compare(sleigh().model, samples=4).digits > 14
-
-
 def test_momenta_along_symmetries_that_the_rows_allow_are_constant() -> None:
     T = m * (xdot**2 + ydot**2) / 2 + J * w**2 / 2
     lag = Lagrangian(
