@@ -5,7 +5,7 @@ MuJoCo's writer keeps six digits. Here numbers are the shortest decimals that gi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 import mujoco
@@ -16,6 +16,7 @@ from mbkit._escape import xml_attribute, xml_comment
 from mbkit.engines.mujoco.constraints import OF_JOINTS, OF_TENDON
 from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.mujoco.model import INERTIA, MUJOCO, OF_COUPLING, Placed, by_mbkit, heard_warnings, mapped, specified
+from mbkit.engines.simulation_settings import Servo, Settings
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.load.mjcf import JOINT_NUMBERS
 from mbkit.load.mjcf_reader import KINDS
@@ -67,20 +68,59 @@ MJCF: Final = Path(
 )
 
 
-def mjcf_text(model: Model, comment: str) -> str:
-    """Return a description as MJCF, or raise `UnsupportedError` with all that MJCF cannot hold of it."""
+def mjcf_text(model: Model, comment: str, settings: Settings | None = None) -> str:
+    """Return a description as MJCF, or raise `UnsupportedError` with all that MJCF cannot hold of it.
+
+    With settings of a simulation the text has them too: options and actuators.
+    """
     MJCF.admit(model)
     spec, placed, _ = specified(model)
     lines = [
         f"<mujoco model={xml_attribute(model.name)}>",
         f"  <!-- {xml_comment(comment)} -->",
         '  <compiler angle="radian" autolimits="false" inertiafromgeom="false" balanceinertia="false"/>',
-        f"  <option{_attributes(gravity=model.gravity)}/>",
+        *_options(model, settings or Settings()),
         "  <worldbody>",
     ]
     owners = {name: joint for joint in model.joints for name in placed.joints[joint.name]}
     lines += [*_body(spec.worldbody, owners, placed, model, "    "), "  </worldbody>"]
-    return "\n".join([*lines, *_tendons(spec, model), *_equalities(spec, model), "</mujoco>", ""])
+    servos = _actuators((settings.servos if settings else None) or (), placed)
+    return "\n".join([*lines, *_tendons(spec, model), *_equalities(spec, model), *servos, "</mujoco>", ""])
+
+
+def _options(model: Model, settings: Settings) -> Iterator[str]:
+    own: dict[str, Any] = {"timestep": settings.time_step, "tolerance": settings.tolerance}
+    if settings.integrator:
+        name = settings.integrator.removeprefix("mujoco_")
+        own["integrator"] = {"euler": "Euler", "rk4": "RK4"}.get(name, name)
+    if settings.solver:
+        own["solver"] = {"newton": "Newton"}.get(settings.solver, settings.solver.upper())
+    if settings.iterations:
+        own["iterations"] = str(settings.iterations)
+    flags = {"eulerdamp": settings.implicit_damping, "limit": settings.limits}
+    off = {name: "disable" for name, on in flags.items() if on is False}
+    yield f"  <option{_attributes(gravity=model.gravity, **own)}{'>' if off else '/>'}"
+    if off:
+        yield f"    <flag{_attributes(**off)}/>"
+        yield "  </option>"
+
+
+def _actuators(servos: Sequence[Servo], placed: Placed) -> Iterator[str]:
+    if servos:
+        yield "  <actuator>"
+    for x in servos:
+        (joint,) = placed.joints[x.joint]
+        gain = {"position": x.kp, "velocity": x.kv}.get(x.kind, 1.0)
+        own: dict[str, Any] = {"name": x.joint, "joint": joint, "gear": x.gear, "gainprm": gain}
+        own |= {} if x.kind == "motor" else {"biastype": "affine", "biasprm": (0.0, -x.kp, -x.kv)}
+        for name, limited, bounds in (
+            ("ctrlrange", "ctrllimited", x.control_range),
+            ("forcerange", "forcelimited", x.force_range),
+        ):
+            own |= {limited: "true", name: bounds} if np.isfinite(bounds).all() else {}
+        yield f"    <general{_attributes(**own)}/>"
+    if servos:
+        yield "  </actuator>"
 
 
 def read_back(model: Model, text: str) -> MujocoDynamics:
