@@ -36,7 +36,7 @@ def model_of(target: str, options: Mapping[str, Any] | None = None) -> Model:
     options = options or {}
     if _FUNCTION.fullmatch(target) and not os.path.exists(target):
         _refuse(options, "a function")
-        return _from_function(*target.split(":"))
+        return _from_function(target)
     named = catalog.systems()
     if target in named:
         if find(target) is None:
@@ -69,8 +69,9 @@ def _refuse(options: Mapping[str, Any], what: str) -> None:
         raise InputError(f"{names}: only for robots and files; the target is {what}, which makes its own model")
 
 
-def _from_function(module_name: str, name: str) -> Model:
-    target = f"{module_name}:{name}"
+def function_of(target: str) -> Any:
+    """Return what ``package.module:function`` names; the current folder is searched first."""
+    module_name, _, name = target.partition(":")
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
     with _blamed(f"{target}: cannot import {module_name!r}"):
@@ -80,6 +81,11 @@ def _from_function(module_name: str, name: str) -> Model:
         if not hasattr(value, part):
             raise UnknownNameError("function", part, [n for n in dir(value) if n[0] != "_"], f"(in {where})")
         value, where = getattr(value, part), f"{where}.{part}"
+    return value
+
+
+def _from_function(target: str) -> Model:
+    value = function_of(target)
     if callable(value):
         with _blamed(f"{target}: the function failed"):
             value = value()

@@ -69,8 +69,12 @@ def _data(value: Any) -> Any:
     return [_data(x) for x in value] if isinstance(value, (list, tuple)) else value
 
 
+#: Of a field that plain data leaves out.
+NOT_PLAIN: Final = types.MappingProxyType({"plain": False})
+
+
 def _names(value: Any) -> list[str]:
-    return [*(f.name for f in fields(value)), *getattr(value, "_derived", ())]
+    return [*(f.name for f in fields(value) if f.metadata.get("plain", True)), *getattr(value, "_derived", ())]
 
 
 def to_plain(value: Any) -> Any:

@@ -1,6 +1,22 @@
 """Why two descriptions, importers or engines differ."""
 
+from mbkit.engines.simulation_settings import Servo, Settings
+from mbkit.studies.explain.motion import Motion, file_settings
+from mbkit.studies.explain.motion_result import CauseMotion, MotionComparison, RecordComparison
+from mbkit.studies.explain.records import record_of
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
 
-__all__ = ["Cause", "Explanation", "explain"]
+__all__ = [
+    "Cause",
+    "CauseMotion",
+    "Explanation",
+    "Motion",
+    "MotionComparison",
+    "RecordComparison",
+    "Servo",
+    "Settings",
+    "explain",
+    "file_settings",
+    "record_of",
+]

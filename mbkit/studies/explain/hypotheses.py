@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import chain, permutations, product
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -37,6 +37,17 @@ from mbkit.studies.explain.merged_model import (
 )
 
 Part = TypeVar("Part")
+
+
+class Holder(Protocol):
+    """A description, or what holds one: it can change fields of its parts."""
+
+    def put(self, where: Where, values: Mapping[str, Any]) -> Self:
+        """Return it with other fields in one part."""
+        ...
+
+
+Held = TypeVar("Held", bound=Holder)
 
 #: Kind of a difference, and noun, where they are not the description's word for a part.
 _WORDS: Final = {
@@ -108,13 +119,17 @@ class Hypothesis:
     a: Any = None
     b: Any = None
 
-    def apply(self, x: MergedModel) -> MergedModel:
+    def sentence(self, other: str) -> str:
+        """Return what it says of the other side, by its name."""
+        return f"{self.subject}{': ' * bool(self.subject)}{other} {self.says}"
+
+    def apply(self, x: Held) -> Held:
         """Put the difference into a description."""
         for change in self.changes:
             x = x.put(change.where, change.theirs)
         return x
 
-    def revert(self, x: MergedModel) -> MergedModel:
+    def revert(self, x: Held) -> Held:
         """Take the difference out of a description that has it."""
         for change in self.changes:
             x = x.put(change.where, change.ours)

@@ -18,8 +18,17 @@ from mbkit._check import Array, by_key
 from mbkit.model import Body, Joint, Model
 from mbkit.model.elements.references import _OF_BODIES, hung_on, names_in, renamed
 from mbkit.model.joint_types import FIXED, PRISMATIC
-from mbkit.studies.explain.hypotheses import Hypothesis, differences, links_in_common_axes
-from mbkit.studies.explain.merged_model import OTHERS, MergedModel, Tolerances, at_itself, merge, reattached
+from mbkit.studies.explain.hypotheses import Change, Hypothesis, differences, links_in_common_axes, turn_of
+from mbkit.studies.explain.merged_model import (
+    BASE_FRAME,
+    OTHERS,
+    MergedModel,
+    Tolerances,
+    at_itself,
+    merge,
+    number_text,
+    reattached,
+)
 from mbkit.studies.explain.terms import fitting, restricted
 
 #: Costs of another name, a frame or number that differs, another kind, and a joint that stays alone.
@@ -140,8 +149,8 @@ def rename_joints(b: MergedModel, a: Model, matching: Matching) -> MergedModel:
     """Return `b` with the names and the order of `a` where joints match."""
     own = {j.name: j for j in b.model.joints}
     theirs = {j.name: j.child for j in a.joints}
-    # Joints that were held still or removed are in the matching, but not in the description.
-    alone = [own[n] for n in matching.only_b if n in own]
+    # Joints that were held still or removed are in the matching, and those that they carry may be in the description.
+    alone = [j for n, j in own.items() if n not in matching.to_b.values()]
     joints = {j.name: f"{j.name} of the second" for j in alone} | {m.b: m.a for m in matching.pairs}
     bodies = {j.child: f"{j.child} of the second" for j in alone} | {
         own[m.b].child: theirs[m.a] for m in matching.pairs
@@ -205,6 +214,39 @@ def align_frames(b: MergedModel, a: Model, near: Tolerances) -> tuple[MergedMode
         _, R, p = places[name]
         links[name] = tuple(replace(x, R=R @ x.R, p=p + R @ x.p) for x in some)
     return MergedModel(model, links), tuple(moved)
+
+
+def align_bases(one: MergedModel, b: MergedModel, near: Tolerances) -> tuple[MergedModel, list[Hypothesis]]:
+    """Return `b` with the frames of its free bodies where `one` has them, and the differences that this takes away.
+
+    A frame is moved as a joint on the body says, if then at least two parts less differ: the frame of a free body is
+    no free choice, as its coordinates are the frame's pose.
+    """
+    moved = []
+    for joint in (j for j in one.model.joints if j.type.floating and b.model.joint(j.name).kind == j.kind):
+        carried = [c for c in one.model.joints if c.parent == joint.child]
+        pairs = [(c, b.model.joint(c.name)) for c in carried if b.model.joint(c.name).parent == joint.child]
+        before = _count_between(one, b, near)
+        for here, there in pairs[:2]:
+            # Where the first's frame is in the second's.
+            R = there.rotation @ here.rotation.T
+            p = there.translation - R @ here.translation
+            if near.vector(R, np.eye(3)) and near.point(p, np.zeros(3)):
+                continue
+            other = b.put((BASE_FRAME, joint.name), {"frame": (R, p)})
+            if _count_between(one, other, near) > before - 2:
+                continue
+            turn = float(np.linalg.norm(turn_of(R)))
+            says = f"has the body's frame turned by {number_text(turn)} rad and moved by {number_text(-R.T @ p)} m"
+            change = Change((BASE_FRAME, joint.name), {"frame": (R, p)}, {"frame": (R.T, -R.T @ p)})
+            moved.append(Hypothesis("frame of the free joint", f"joint {joint.name!r}", says, (change,)))
+            b = other
+            break
+    return b, moved
+
+
+def _count_between(a: MergedModel, b: MergedModel, near: Tolerances) -> int:
+    return len(differences(*links_in_common_axes(a, b, near), near))
 
 
 def _moved(joint: Joint, body: Body, R: Array, p: Array) -> tuple[Joint, Body]:
@@ -304,7 +346,7 @@ def _count_differences(a: Model, b: Model, near: Tolerances) -> float:
     there, _ = align_frames(rename_joints(other, one.model, matching), one.model, near)
     alone = len(matching.only_a) + len(matching.only_b)
     ground = not near.number(one.ground.mass, there.ground.mass)
-    return len(differences(*links_in_common_axes(one, there, near), near)) + 2.0 * alone + ground
+    return _count_between(one, there, near) + 2.0 * alone + ground
 
 
 def _structural_cause(

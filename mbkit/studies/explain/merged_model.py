@@ -163,6 +163,8 @@ class MergedModel:
         section, *names = where
         if not section:
             return replace(self, model=replace(self.model, **values))
+        if section == BASE_FRAME:
+            return self._with_base_frame(self.model.joint(names[0]).child, *values["frame"])
         if not names:
             kept = [p for p in getattr(self.model, section) if p.name not in values]
             return self.put(("",), {section: (*kept, *(p for p in values.values() if p is not None))})
@@ -177,7 +179,19 @@ class MergedModel:
         parts = (replace(p, **values) if p.name == name else p for p in getattr(self.model, section))
         return self.put(("",), {section: tuple(parts)})
 
+    def _with_base_frame(self, body: str, R: Array, p: Array) -> MergedModel:
+        """Return the description with the frame of a free body at R, p in the old one; q and v then differ."""
+        places = {body: (body, R.T, -R.T @ p)}
+        model = reattached(self.model, places)
+        joints = tuple(hung_on(j, places, []) if j.parent == body else j for j in model.joints)
+        links = tuple(replace(x, R=R.T @ x.R, p=R.T @ (x.p - p)) for x in self.links[body])
+        own = Body(body, **vars(composite(links)))
+        bodies = tuple(own if x.name == body else x for x in model.bodies)
+        return MergedModel(replace(model, joints=joints, bodies=bodies), {**self.links, body: links})
 
+
+#: Section of a change of where the frame of a free body is drawn, which stands before the joint's name.
+BASE_FRAME: Final = "base frame"
 #: A body's frame on another body: that one's name, and R and p there.
 Place = tuple[str, Array, Array]
 

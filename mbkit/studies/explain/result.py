@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
@@ -15,10 +15,13 @@ from mbkit._escape import one_line
 from mbkit.engines.base import MAX_NAMES
 from mbkit.model.validation import listing
 from mbkit.studies.document import Block, Bullet, Column, Document, Items, Section, Span, Style, Table
+from mbkit.studies.explain.hypotheses import Hypothesis
 from mbkit.studies.explain.joint_matching import Match
+from mbkit.studies.explain.motion_result import MotionComparison, RecordComparison
 from mbkit.studies.explain.terms import WHOLE, Gap
+from mbkit.studies.explain.worlds import Changed, changed
 from mbkit.studies.formatting import error_text
-from mbkit.studies.results import ResultTable, columns_of
+from mbkit.studies.results import NOT_PLAIN, ResultTable, columns_of
 
 
 @dataclass(frozen=True)
@@ -41,9 +44,29 @@ class Cause:
     b: Any
     effects: dict[str, float]
     acts: bool
+    change: Hypothesis | None = field(default=None, repr=False, compare=False, metadata=NOT_PLAIN)
 
     def __str__(self) -> str:
         return self.says
+
+    def apply(self, side: Changed) -> Changed:
+        """Return the first description with this change alone, its links that are fixed together merged.
+
+        Parameters
+        ----------
+        side : Model or Settings
+            The first description; settings where the cause is one of the simulator (`MotionComparison.effects`).
+
+        Raises
+        ------
+        UnsupportedError
+            A cause that no part of the description holds: other names, joints that one side alone has.
+        """
+        return changed(self.change, self.says, side)
+
+    def revert(self, side: Changed) -> Changed:
+        """Return the second description without this change, in the names and frames of the first."""
+        return changed(self.change, self.says, side, back=True)
 
 
 @dataclass(frozen=True)
@@ -60,7 +83,8 @@ class Explanation(ResultTable):
     says whether M is zero on both sides at every state, so that equal terms are no agreement. `compared` says whether
     accelerations of the whole systems were: there are none without a state that keeps the constraints, nor where the
     mass matrix is singular. `beside` has what differs, or was not compared, of two files beside their terms: options of
-    simulation, servos, contacts.
+    simulation, servos, contacts. `motion` has what each cause does to a motion, `records` what turns one
+    recorded motion into another, where that was asked.
     """
 
     a: str
@@ -82,6 +106,8 @@ class Explanation(ResultTable):
     massless: bool = False
     compared: bool = True
     beside: tuple[str, ...] = ()
+    motion: MotionComparison | None = None
+    records: RecordComparison | None = None
 
     @property
     def acting(self) -> tuple[Cause, ...]:
@@ -101,7 +127,8 @@ class Explanation(ResultTable):
     @property
     def verdict(self) -> str:
         """One sentence: the same, or why not."""
-        return self._of_terms + (f"; {listing(self.beside, MAX_NAMES)}" if self.beside else "")
+        moved = "".join(f"; {x.verdict}" for x in (self.motion, self.records) if x is not None)
+        return self._of_terms + (f"; {listing(self.beside, MAX_NAMES)}" if self.beside else "") + moved
 
     @property
     def _of_terms(self) -> str:
@@ -153,6 +180,7 @@ class Explanation(ResultTable):
             sections=[
                 Section("Terms, by joint name", [Table(gaps, self.gaps)]),
                 Section("Causes", cause_blocks(self.causes)),
+                *(section for x in (self.motion, self.records) if x is not None for section in x.sections()),
                 Section(f"Joints: {by_name} matched by name, and", [Items([Bullet("", text) for text in joints])]),
                 Section("Notes", [Items([Bullet("", note) for note in self.notes])]),
             ],

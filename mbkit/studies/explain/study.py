@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
 
 import numpy as np
 
@@ -26,8 +26,17 @@ from mbkit.studies.explain.hypotheses import (
     links_in_common_axes,
     summarized_differences,
 )
-from mbkit.studies.explain.joint_matching import Match, Matching, align_frames, reconcile_joint_sets, rename_joints
+from mbkit.studies.explain.joint_matching import (
+    Match,
+    Matching,
+    align_bases,
+    align_frames,
+    reconcile_joint_sets,
+    rename_joints,
+)
 from mbkit.studies.explain.merged_model import MergedModel, Tolerances, merge, number_text, with_common_frames
+from mbkit.studies.explain.motion import Compared, Motion, compare_motions, with_engines
+from mbkit.studies.explain.records import compare_records
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.terms import WHOLE, Gap, Gaps, effects, larger, model_terms, states_of, worst
 from mbkit.studies.results import to_plain
@@ -44,6 +53,8 @@ def explain(
     seed: int = 0,
     tolerance: float = 1e-9,
     names: tuple[str, str] | None = None,
+    motion: bool | Motion = False,
+    rollouts: tuple[Any, Any] | None = None,
 ) -> Explanation:
     """Explain why two descriptions, or two engines, differ.
 
@@ -64,6 +75,12 @@ def explain(
         descriptions and of terms.
     names : (str, str), optional
         Names of the two sides; by default those of their models or engines.
+    motion : bool or Motion
+        Whether both are moved by one controller, and each cause is measured by what it does to the motion, in rad and
+        m; a `Motion` says how. Settings of the two simulators are causes then too.
+    rollouts : (record, record), optional
+        Two recorded motions of any simulators from one start; see `mbkit.studies.explain.record_of`. The first
+        description is run with each known cause and each pair of them, to find what turns one record into the other.
 
     Raises
     ------
@@ -89,8 +106,17 @@ def explain(
         one, other = (replace(x, time=_moment(model_a, model_b)) for x in (model_a, model_b))
         own = [x.engine if isinstance(x, Dynamics) else x.name for x in (a, b)]
         names = names or ((own[0], own[1]) if own[0] != own[1] else ("first", "second"))
-        out = _Descriptions(one, other, names, samples, seed, tolerance).explain()
-        return engine_causes(a, b, out) if isinstance(a, Dynamics) or isinstance(b, Dynamics) else out
+        study = _Descriptions(one, other, names, samples, seed, tolerance)
+        out = study.explain()
+        out = engine_causes(a, b, out) if isinstance(a, Dynamics) or isinstance(b, Dynamics) else out
+        if rollouts is not None:
+            how = with_engines(motion if isinstance(motion, Motion) else Motion(), a, b)
+            return replace(out, records=compare_records(study.compared, how, rollouts, names))
+        if not motion:
+            return out
+        how = with_engines(motion if isinstance(motion, Motion) else Motion(), a, b)
+        found = compare_motions(study.compared, how, names)
+        return replace(out, motion=found, agree=out.agree and not any(x.largest > tolerance for x in found.effects))
 
 
 def _model(x: Model | Dynamics, which: str) -> Model:
@@ -121,6 +147,7 @@ class _Descriptions:
     samples: int
     seed: int
     tolerance: float
+    compared: Compared = field(init=False)
 
     def explain(self) -> Explanation:
         near = Tolerances.of(self.a, self.tolerance)
@@ -129,6 +156,7 @@ class _Descriptions:
         one, other, matching, structural = reconcile_joint_sets(self.a, self.b, near)
         theirs = rename_joints(other, one.model, matching)
         target, moved_frames = align_frames(theirs, one.model, near)
+        target, bases = align_bases(one, target, near)
         before = by_name or self._gaps(one.model, theirs.model)
         whole = self._whole(one.model, theirs.model) if (alike := worst(before) <= self.tolerance) else ()
         one, target = with_common_frames(*links_in_common_axes(one, target, near))
@@ -140,7 +168,7 @@ class _Descriptions:
         causes = (
             *(self._cause(h, {"M": np.inf}) for h in structural),
             *self._naming_causes(one, other, matching, by_name),
-            *(self._measured_cause(h, one, target) for h in hypotheses),
+            *(self._measured_cause(h, one, target) for h in (*bases, *hypotheses)),
             # Joints that one side alone has are locked here; a body behind one of them does not stand still.
             *(
                 self._cause(h, {})
@@ -149,6 +177,9 @@ class _Descriptions:
             ),
             *(self._cause(h, effects(found)) for h, found in held),
         )
+        read = wholes[0], rename_joints(wholes[1], one.model, matching)
+        order = tuple(j.name for j in other.model.independent_joints)
+        self.compared = Compared((one, target), read, (*hypotheses,), (*bases,), (*structural,), matching, order)
         acting = [c.kind for c in causes if c.acts]
         massless = bool(one.model.nv) and self._is_massless(one.model) and self._is_massless(target.model)
         found = larger(before, self._large(whole), *(more for _, more in held)) if before else ()
@@ -230,8 +261,8 @@ class _Descriptions:
 
     def _cause(self, h: Hypothesis, by_term: dict[str, float]) -> Cause:
         acts = any(not x <= self.tolerance for x in by_term.values())
-        head = f"{h.subject}: " if h.subject else ""
-        return Cause(h.kind, h.subject, f"{head}{self.names[1]} {h.says}", to_plain(h.a), to_plain(h.b), by_term, acts)
+        numbers = to_plain(h.a), to_plain(h.b)
+        return Cause(h.kind, h.subject, h.sentence(self.names[1]), *numbers, by_term, acts, h)
 
     def _measured_cause(self, h: Hypothesis, one: MergedModel, target: MergedModel) -> Cause:
         """Return a difference with the larger of its two effects, added alone to one side or removed from the other."""
