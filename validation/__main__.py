@@ -58,6 +58,9 @@ PARTS = {
     "transfer": Part(
         40, ("transfer.json",), "robots in five engines beside the exact motion, and what each usual change does"
     ),
+    "motion_causes": Part(
+        2, ("motion_causes.json",), "twenty pairs of files with drawn faults: causes named, and their effect in radians"
+    ),
     "environments": Part(10, (), "tests of engines in environments of their own; makes 3 GB of these"),
     "planted": Part(7, ("planted.json",), "a hundred planted defects, and the tests that catch them"),
     "fuzz": Part(10, ("fuzz.json",), "random and damaged files, random trees"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mbkit.cli import _shared as shared
-from mbkit.errors import MbkitError, ModelError, OutputError
+from mbkit.errors import InputError, MbkitError, ModelError, OutputError
 
 if TYPE_CHECKING:
     from mbkit.model import Model
@@ -33,15 +33,43 @@ if TYPE_CHECKING:
 @click.option(
     "--tolerance", default=1e-9, show_default=True, type=click.FloatRange(min=0, min_open=True), help="What counts."
 )
+@click.option("--motion", is_flag=True, help="Measure each cause in rad and m, on runs of both under one controller.")
+@click.option(
+    "--controller",
+    metavar="FUNCTION",
+    help="With --motion: package.module:function of (t, q, v), CSV of torques, or passive.  [default: a posture]",
+)
+@click.option("--bound", default=0.05, show_default=True, type=click.FloatRange(min=0, min_open=True), help="rad or m.")
+@click.option("--dt", type=click.FloatRange(min=0, min_open=True), help="With --motion: step of both simulations, s.")
+@click.option("--rollouts", nargs=2, type=click.Path(), metavar="CSV CSV", help="Two recorded motions to explain.")
+@click.option("--write", "path", type=click.Path(path_type=Path), help="File for FIRST with causes taken over.")
+@click.option(
+    "--take", multiple=True, type=click.IntRange(min=1), help="A cause to write; may be repeated.  [default: all]"
+)
 @shared.load_options
 @shared.json_option
 def diff(
-    first: str, second: str | None, engines: tuple[str, ...], options: dict[str, Any], as_json: bool, **settings: Any
+    first: str,
+    second: str | None,
+    engines: tuple[str, ...],
+    options: dict[str, Any],
+    as_json: bool,
+    motion: bool,
+    controller: str | None,
+    bound: float,
+    dt: float | None,
+    rollouts: tuple[str, str] | None,
+    path: Path | None,
+    take: tuple[int, ...],
+    **settings: Any,
 ) -> None:
     """Say why SECOND moves otherwise than FIRST, and name the causes.
 
     Both are what `mbkit check` takes, with q and v as `mbkit.load` has them. A URDF is compared link by link, so that
     links which are fused wrongly are named. With two engines they are compared on one description, or each on its own.
+
+    With --motion both are simulated from one start, an MJCF with the options and actuators of its file, and each cause
+    has its effect in rad and m. With --rollouts the causes are found that turn one recorded motion into the other.
     """
     if engines:
         shared.check_engines(engines, least=2)
@@ -49,6 +77,9 @@ def diff(
             raise click.UsageError("--engines takes two")
     elif second is None:
         raise click.UsageError("give two descriptions, or one and --engines A,B")
+    moved = motion or rollouts is not None or path is not None
+    if not moved and (controller or dt):
+        raise click.UsageError("--controller and --dt go with --motion or --rollouts")
     from mbkit.engines import dynamics
     from mbkit.studies.explain import explain
 
@@ -60,13 +91,54 @@ def diff(
     else:
         a, b = (os.path.basename(target) or target for target in targets)
         names = (a, b) if a != b else (targets[0], targets[1])
+    if moved:
+        settings |= {"motion": _motion(targets, sides, controller, bound, dt), "rollouts": rollouts}
     result = explain(*sides, names=names, **settings)
-    if not engines and (beside := _beside_terms(first, str(second))):
+    if path is not None:
+        _write(result, path, take)
+    if not engines and not moved and (beside := _beside_terms(first, str(second))):
         unlike = not beside[0].startswith("not compared")
         head = "beside the terms: " if unlike else ""
         result = replace(result, beside=(f"{head}{beside[0]}", *beside[1:]), agree=result.agree and not unlike)
     shared.show(result.document(), as_json=as_json)
     shared.leave(shared.AGREE if result.agree else shared.DIFFER)
+
+
+def _motion(
+    targets: Sequence[str], sides: Sequence[Any], controller: str | None, bound: float, dt: float | None
+) -> Any:
+    """Return how both are moved: with what their files say of a simulation, and one controller."""
+    import numpy as np
+
+    from mbkit.load.loader import find
+    from mbkit.studies._targets import function_of
+    from mbkit.studies.explain import Motion, Settings, file_settings
+
+    held, left_out = list[Any](), list[tuple[str, ...]]()
+    for k, side in enumerate(sides):
+        target, engine = targets[k % len(targets)], getattr(side, "engine", None)
+        robot = find(target)
+        own, left = (None, ()) if engine else file_settings(robot.path if robot else target, side)
+        held.append(replace(own or Settings(engine=engine), time_step=dt) if dt is not None else own)
+        left_out.append(left)
+    law: Any = controller or "posture"
+    if ":" in law:
+        law = function_of(law)
+    elif law not in ("posture", "passive"):
+        try:
+            law = np.loadtxt(law, delimiter=",", ndmin=2)
+        except (OSError, ValueError) as error:
+            raise InputError(f"--controller: no function, and no CSV of torques alone: {error}") from None
+    return Motion(controller=law, bound=bound, settings=(held[0], held[1]), left_out=(left_out[0], left_out[1]))
+
+
+def _write(result: Any, path: Path, take: Sequence[int]) -> None:
+    """Write the first description with causes taken over, and say what was written."""
+    from mbkit.studies.written_causes import write_causes
+
+    for note in write_causes(result, path, take):
+        shared.say("note", note)
+    shared.say("written", f"{path}: read back, it says the same")
 
 
 def _beside_terms(first: str, second: str) -> tuple[str, ...]:

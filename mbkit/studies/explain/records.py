@@ -159,9 +159,9 @@ def _checked(x: Record, model: Model, which: str) -> Record:
 
 def expect_same_units(a: Record, b: Record) -> None:
     """Raise where one record begins at the other's positions in degrees."""
-    one, other = a.q[0], b.q[0]
-    some = (np.abs(one) > 1e-6) & (np.abs(other) > 1e-6)
-    for which, x, y in (("second", one, other), ("first", other, one)):
+    starts = {"first": a.q[0], "second": b.q[0]}
+    some = np.all([np.abs(x) > 1e-6 for x in starts.values()], axis=0)
+    for (which, y), x in zip(starts.items(), reversed(starts.values()), strict=True):
         if some.any() and np.allclose(y[some] * _DEGREE, x[some], rtol=1e-3, atol=0.0):
             raise InputError(
                 f"rollouts: the {which} is in degrees; multiply its positions and velocities by {_DEGREE:.7f}"
