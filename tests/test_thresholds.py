@@ -716,16 +716,20 @@ def clustered(count: int) -> np.ndarray:
     return meshes.thinned([meshes.Surface(vertices, triangles, None)], 20)[0].triangles
 
 
+def told_apart(constant: str, decide: Callable[[Any], object], below: Any, above: Any) -> None:
+    place, name = constant.split(":")
+    module = import_module(f"mbkit.{place}")
+    assert decide(below) != decide(above)
+    value = getattr(module, name)
+    for changed in (max(value // 10, 1) if isinstance(value, int) else value / 10, value * 10):
+        with pytest.MonkeyPatch.context() as there:
+            there.setattr(module, name, changed)
+            assert decide(below) == decide(above), changed
+
+
 @pytest.mark.parametrize("constant", DECIDES)
 def test_threshold_decides_between_its_two_sides(
     constant: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    place, name = constant.split(":")
-    module, (decide, below, above) = import_module(f"mbkit.{place}"), DECIDES[constant]
-    assert decide(below) != decide(above)
-    value = getattr(module, name)
-    for changed in (max(value // 10, 1) if isinstance(value, int) else value / 10, value * 10):
-        with monkeypatch.context() as there:
-            there.setattr(module, name, changed)
-            assert decide(below) == decide(above), changed
+    told_apart(constant, *DECIDES[constant])
