@@ -287,7 +287,7 @@ def test_the_least_of_two_margins_that_end_together_is_found_in_few_rounds() -> 
     both = np.arange(2)
     found = first_zero(margins, margins(np.zeros(2), both), margins(np.ones(2), both))
     assert np.abs(found - roots.min(axis=1)).max() < 4 * EPS
-    assert len(rounds) < 20
+    assert len(rounds) < 13
 
 
 @pytest.mark.parametrize("engine", ["lagrangian", "mujoco"])

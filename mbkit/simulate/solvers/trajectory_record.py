@@ -102,8 +102,9 @@ class GridRecord(RunRecord):
         self.kept = problem.kept
         n, rows = len(problem.q), len(problem.kept)
         # Written by the threads, so that each of them pays for its own pages.
-        room = room or tuple(np.empty((n, rows, x.shape[1])) for x in (problem.q, problem.v))
-        self.q, self.v = (x[:] for x in room)
+        own = (np.empty((n, rows, x.shape[1])) for x in (problem.q, problem.v))
+        # Of a room are views, as results are read-only; a view among results would be copied.
+        self.q, self.v = (x[:] for x in room) if room else own
         self.good: Indices = np.zeros(n, dtype=np.intp)
         if self.kept[0] == 0:
             self.q[:, 0], self.v[:, 0] = problem.q, problem.v

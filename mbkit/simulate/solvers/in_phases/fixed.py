@@ -596,7 +596,7 @@ def first_zero(function: Callable[[Array, Indices], Array], before: Array, after
         x[end, going], f[end, going] = guess, values
         out[going], best[going] = np.where(size < before, guess, out[going]), np.minimum(size, before)
         left = x[1, going] - x[0, going]
-        slow[going] = np.where(left > 0.5 * width, slow[going] + 1, 0)
+        slow[going] = np.where((left > 0.5 * width) & (size > 0.5 * before), slow[going] + 1, 0)
         # Small values that do not fall are rounding.
         noise = (size < _MAX_NOISE) & (size > 0.5 * before)
         going = going[(size > 1) & ~noise & (left > 4 * EPS * (1 + guess))]
