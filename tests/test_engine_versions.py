@@ -507,3 +507,13 @@ def test_versions_side_by_side_show_which_changed_a_number_and_where_to(tmp_path
     assert any("SIGABRT" in x["reason"] for x in found["reasons"])
     assert not found["wrong"]
     assert found["robots"][str(path)]["digits"] > 13
+
+
+def test_a_version_of_an_engine_is_explained_on_another_description():
+    """What is put into one description, or left of a robot, is asked of the same version."""
+    model = mb.catalog.double_pendulum()
+    heavy = mb.catalog.double_pendulum(mass2=1.5)
+    other = mb.dynamics(heavy, present("mujoco", "4.0.0"))
+    found = mb.explain(mb.dynamics(model), other)
+    assert [c.kind for c in found.causes] == ["mass"]
+    assert found.explained

@@ -148,6 +148,10 @@ def test_every_setting_is_compared() -> None:
     for f in fields(Settings):
         value = other.get(f.name, getattr(a, f.name) * 2 if f.name != "implicit_damping" else False)
         value = True if f.name == "limits" else value
+        if f.name == "engine":
+            (found,) = setting_differences(a, replace(a, engine="drake", integrator="drake_sap"))
+            assert found.kind == "engine"
+            continue
         (found,) = setting_differences(a, replace(a, **{f.name: value}))
         assert f.name == "servos" or found.kind == WORDS[f.name][0]
     for f in fields(Servo):
@@ -376,3 +380,13 @@ def test_the_command_measures_writes_and_refuses(tmp_path: Path, monkeypatch: py
     assert run("--motion", "--controller", "laws:law").exit_code == 1
     assert run("--motion", "--controller", "lost.csv").exit_code == 2
     assert run("--controller", "passive").exit_code == 2
+
+
+def test_engines_run_with_their_own_integrators() -> None:
+    model = mb.load("ur5")
+    found = mb.explain(*(mb.dynamics(model, x) for x in ("mujoco", "drake")), motion=Motion(times=(0.1, 0.2))).motion
+    assert found is not None
+    assert [x.kind for x in found.effects] == ["engine"]
+    # Without damping both are the same formula.
+    assert found.effects[0].largest < 1e-12
+    assert "drake_sap" in found.settings[1]

@@ -19,6 +19,7 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import TINY, Array
 from mbkit.engines import Dynamics, dynamics
+from mbkit.engines.remote.dynamics import VersionDynamics
 from mbkit.errors import KnownDefectWarning, MbkitError, UnsupportedError
 from mbkit.load.shapes import NOTHING, MassProperties
 from mbkit.model import JointCoupling, Model
@@ -80,7 +81,7 @@ def engine_causes(a: Model | Dynamics, b: Model | Dynamics, out: Explanation) ->
 def _engine_on(x: Model | Dynamics, model: Model) -> Dynamics:
     if not isinstance(x, Dynamics):
         return dynamics(model)
-    return x if x.model is model or x.model == model else type(x)(model)
+    return x if x.model is model or x.model == model else x._of_model(model, model.form_digest)
 
 
 class _Trial(NamedTuple):
@@ -123,7 +124,11 @@ class _Engines:
         """Return the first engine's terms of another description or at other states; none where it refuses."""
         at = replace(self.at, **states)
         try:
-            return model_terms(model, at) if self.pinocchio_agrees else evaluated(type(self.a)(model), at)
+            return (
+                model_terms(model, at)
+                if self.pinocchio_agrees
+                else evaluated(self.a._of_model(model, model.form_digest), at)
+            )
         except MbkitError:
             return {}
 
@@ -354,14 +359,17 @@ class _Engines:
         return float(x @ [mass_properties.mass for mass_properties in _PROBE_BODIES]), own | moved
 
     def subtree(self) -> tuple[str, ...]:
-        """Return the smallest part on which the two engines still differ."""
+        """Return the smallest part on which the two engines still differ; of engines in this process alone."""
         whole = merge(self.model).model
+        if any(isinstance(x, VersionDynamics) for x in (self.a, self.b)):
+            # Each part of the robot would start a process of its own.
+            return ()
 
         def differs(names: set[str]) -> bool:
             some = terms.restricted(whole, names).without(*CONSTRAINT_FEATURES)
             at = terms.states_of(some, len(self.at.q), 0)
             try:
-                one, other = (evaluated(type(x)(some), at) for x in (self.a, self.b))
+                one, other = (evaluated(x._of_model(some, some.form_digest), at) for x in (self.a, self.b))
             except MbkitError:
                 return False
             return worst(gaps(one, other, at, some)) > self.tolerance

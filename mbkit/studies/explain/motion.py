@@ -135,7 +135,7 @@ class Runner:
 
     def _start(self, model: Model) -> tuple[Array, Array]:
         motion, rng = self.motion, np.random.default_rng(self.motion.seed)
-        if model.constrained:
+        if model.constrained and motion.q is None:
             q, v = model.random_state(rng)
         else:
             q, v = model.neutral(), rng.standard_normal(model.nv)
@@ -149,7 +149,7 @@ class Runner:
         chosen, period, nv = self.motion.controller, first.settings.control_period, first.system.model.nv
         assert period is not None
         if isinstance(chosen, str):
-            passive = None, "no control: both systems move by themselves"
+            passive = None, "none: no torque, and servos at zero"
             return passive if chosen == "passive" else self._posture(first, q)
         if callable(chosen):
             return chosen, f"{getattr(chosen, '__qualname__', 'a function')}, asked every {period:g} s"
@@ -239,7 +239,7 @@ class Runner:
         has no control.
         """
         law, model, layout = self.law, world.system.model, world.system.model.layout
-        if law is None:
+        if law is None or not self.names:
             return None
         names = [n for n in world.order if n in self.names]
         names += [n for n in self.names if n not in names]
@@ -381,8 +381,8 @@ def compare_motions(compared: Compared, motion: Motion, names: tuple[str, str]) 
         pairs = [(first, wholes[0]), (framed, wholes[1])]
         if compared.alone:
             # They are one difference: the joints that a side has alone are held or taken away together.
-            says = "; ".join(f"{h.subject} {h.says}" for h in compared.alone)
-            h = Hypothesis(compared.alone[0].kind, "", says)
+            says = "; ".join(f"{h.subject} ({h.says})" for h in compared.alone)
+            h = Hypothesis(compared.alone[0].kind, "", f"has other joints: {says}")
             found.append(_effect(runner, h, *(None if a is b else runner.apart(a, b) for a, b in pairs)))
         steps = [runner.apart(first, together), *(runner.apart(a, b) for a, b in pairs if a is not b)]
         left, _ = runner.apart(together, framed)

@@ -43,9 +43,15 @@ class World:
 
 def setting_differences(a: Settings, b: Settings) -> Iterator[Hypothesis]:
     """Yield the settings in which two simulations differ, and the numbers of each servo."""
-    for f in fields(Settings):
-        if f.name != "servos" and getattr(a, f.name) != getattr(b, f.name):
-            yield _of_setting(("settings",), f.name, getattr(a, f.name), getattr(b, f.name))
+    # An integrator is an engine's own: where the engines differ, they are one difference.
+    own = ("engine", "integrator")
+    names = [f.name for f in fields(Settings) if f.name != "servos" and not (a.engine != b.engine and f.name in own)]
+    if a.engine != b.engine:
+        ours, theirs = ({n: getattr(x, n) for n in own} for x in (a, b))
+        says = f"runs on {b.engine} with {b.integrator} for {a.engine} with {a.integrator}"
+        yield Hypothesis("engine", "", says, (Change(("settings",), ours, theirs),))
+    for name in (n for n in names if getattr(a, n) != getattr(b, n)):
+        yield _of_setting(("settings",), name, getattr(a, name), getattr(b, name))
     for joint in dict.fromkeys(x.joint for x in (*(a.servos or ()), *(b.servos or ()))):
         one, other = a.servo(joint), b.servo(joint)
         where = ("settings", joint)
