@@ -140,6 +140,7 @@ URDFS = {
     "unknown_type": (with_joint(LIMIT, "hinge"), ["joint 'j': type 'hinge'", "expected one of fixed, revolute"]),
     "no_limit": (with_joint(""), ["joint 'j': a revolute joint needs <limit", "continuous"]),
     "no_effort": (with_joint('<limit lower="0" upper="1" velocity="1"/>'), ["joint 'j': limit effort: missing"]),
+    "negative_effort": (with_joint(LIMIT.replace('t="1"', 't="-1"')), ["joint 'j': limit effort is negative"]),
     "negative_damping": (
         with_joint(LIMIT + '<dynamics damping="-1"/>'),
         ["joint 'j': damping -1 is negative", "line 1"],

@@ -219,6 +219,16 @@ def test_a_changed_description_says_which_parameter(tmp_path, changed, told):
     assert result.verdict in result.text()
 
 
+def test_damping_limits_and_mimic_are_parameters_too():
+    path = RECORDED / "panda.toml"
+    told = [c.text for c in mb.baseline.check(mb.load("panda").without("damping", "limits"), path).changes]
+    assert "damping of joint panda_joint1: 0.003 → 0" in told
+    assert "upper of joint panda_joint1: 2.8973 → inf" in told
+    freed = mb.baseline.check(mb.load("panda", mimic="free"), path)
+    assert [c.text for c in freed.changes] == ["mimic of joint panda_finger_joint2: panda_finger_joint1 → none"]
+    assert "other joints or another order than recorded" in freed.effect
+
+
 def test_named_parameters_and_energies_are_told_by_name(tmp_path):
     path = tmp_path / "a.toml"
     mb.baseline.record(mb.catalog.pendulum(mass=mb.Parameter("m", 1.0)), path, ["lagrangian"])

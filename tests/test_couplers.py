@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -85,6 +86,14 @@ def test_every_engine_moves_a_random_tree_as_elimination_does(seed: int) -> None
         left = dyn.newton_euler_residual(q, v, dyn.forward_dynamics(q, v, tau), tau)
         assert np.abs(left).max() < 1e-11 * max(1.0, np.abs(a).max())
     against_34_digits(model, q, seed, "LAPACK")
+
+
+def test_a_file_says_the_same(tmp_path: Path) -> None:
+    models = [coupled(tree_of(seed), seed) for seed in range(4)]
+    # One leader is an equality of two joints there, and several are one of a tendon.
+    assert {len(x.leaders) > 1 for model in models for x in model.couplers} == {False, True}
+    for k, model in enumerate(models):
+        assert mb.load(mb.convert(model, "mjcf").write(tmp_path / f"{k}.xml")).couplers == model.couplers
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -906,7 +906,7 @@ def test_methods_agree_on_mechanisms_with_stiction_at_all_joints(name: str) -> N
 
 def test_a_joint_that_turns_at_a_singular_pose_ends_a_run_by_name_or_passes_with_a_doubt() -> None:
     """The scissor's slide turns where it is flat, at which a step may have no state."""
-    dyn, q, v = rubbing("scissor", 2, compile=True)
+    dyn, q, v = rubbing("scissor", 2)
     with warnings.catch_warnings(action="ignore"):
         run = mb.simulate(dyn, q, v, 0.6, "rk853", rtol=1e-10)
     assert "singular pose" in "".join((run.stats.message, *run.stats.doubts))

@@ -253,7 +253,7 @@ def test_a_system_of_the_catalog_keeps_the_parts_that_a_user_adds(part):
     if part == "couplers":
         b.add_coupler("belt", joint="theta", leader="x", ratio=2.0)
     elif part == "forces":
-        b.add_joint_force("spring", "x", -3.0 * sp.Symbol("q") ** 3)
+        b.add_joint_force("spring", "x", -3.0 * sp.Symbol("q") ** 3, potential=lambda q: 2.0 * q**4)
     elif part == "prescribed":
         b.prescribe("x", amplitude=0.2, frequency=2.0)
     else:
