@@ -298,6 +298,8 @@ class LagrangianDynamics(Derived):
         columns = dict(zip(self.model.parameters, values.T, strict=True))
         out = self._with(self.model, {name: columns[name] for name in self._batched})
         vars(out)["_parameter_values"] = values
+        if "_law" in vars(self):
+            vars(out)["_law"] = vars(self)["_law"].of_samples(index)
         return out
 
     def _of_sample(self, i: int) -> LagrangianDynamics:

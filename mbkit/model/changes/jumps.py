@@ -11,6 +11,7 @@ falls from s to f at once.) A joint that mimics another has its own friction, wh
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
@@ -107,6 +108,13 @@ class JumpLaw:
         self.which = np.flatnonzero(may @ sizes)
         #: That of a joint that has just let go, (nv,); its sign tells the side, and so it is zero nowhere else.
         self.just_moving: Array = np.where(self.bound > 0, np.maximum(moving, np.finfo(float).tiny), 0.0)
+
+    def of_samples(self, which: NDArray[np.intp]) -> JumpLaw:
+        """Return the law of these samples, by index."""
+        out, own = copy(self), self._numbers
+        out._numbers = own._replace(sliding=own.sliding[which], bound=own.bound[which])
+        out.bound, out.just_moving = self.bound[which], self.just_moving[which]
+        return out
 
     def force(self, v: Array) -> Array:
         """Return the force at speed, zero at rest; (nv,) or (N, nv)."""

@@ -164,8 +164,8 @@ class Phases:
             BESIDE_SOFT_ROWS.admit(dyn.model)
         self.dyn, self._own, self._side_by_side = dyn, dyn._jumps, side_by_side
         self._names = dyn.model.velocity_names
-        #: Velocities with friction.
-        self.which = self._own.law.which
+        #: Velocities with friction. The law of all samples is made here, so that those of some are its rows.
+        self.which = self._own.law_of(dyn).which
         self._rubs = np.isin(np.arange(dyn.model.nv), self.which)
         layout = dyn.model.layout
         places = (
