@@ -37,10 +37,9 @@ _BODIES: Final[tuple[Color, ...]] = (
     (0.52, 0.52, 0.22, 1.0),
 )
 _JOINT: Final[Color] = (0.30, 0.32, 0.35, 1.0)
-#: The camera's half angle in degrees, its elevation in rad, and a picture's width over its height.
+#: The camera's half angle in degrees, and its elevation in rad.
 HALF_ANGLE_DEGREES: Final = 17.5
 _CAMERA_ELEVATION: Final = 0.3
-_PICTURE_ASPECT: Final = 1.2
 
 
 def shapes_of(model: Model, kind: Kind = "visual") -> list[Shape]:
@@ -209,7 +208,8 @@ class Scene:
         azimuth = -np.pi / 2 + 0.5 if wide >= deep else 0.5
         right, up, back = camera_axes(azimuth, _CAMERA_ELEVATION)
         corners = np.array(list(product(*zip(low, high, strict=True)))) - (low + high) / 2
-        needed = np.maximum(np.abs(corners @ up), np.abs(corners @ right) / _PICTURE_ASPECT) / np.tan(
+        # A picture is somewhat wider than it is high.
+        needed = np.maximum(np.abs(corners @ up), np.abs(corners @ right) / 1.2) / np.tan(
             np.deg2rad(HALF_ANGLE_DEGREES)
         )
         return {

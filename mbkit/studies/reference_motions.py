@@ -307,13 +307,6 @@ def _stretch(
 _FLOOR_PER_GAP: Final = 4.0
 # A small system's steps per second of motion: a guess before there is a run.
 _TYPICAL_STEPS_PER_SECOND: Final = 40.0
-# A search with less time left than this makes no series: they need seconds to derive and compile, which it does not
-# count.
-_MIN_SERIES_SECONDS: Final = 5.0
-# The largest number of states at which accelerations are compared.
-_MAX_COMPARED_STATES: Final = 64
-# The relative resolution of a pair of doubles: 106 bits of a number that can be somewhat larger than the motion.
-_PAIR_RESOLUTION: Final = 2.0**-105
 
 
 @dataclass(frozen=True, eq=False)
@@ -492,7 +485,8 @@ def _search(
         ):
             if holds(two_engines, choices, rtol, max(agree, _PARTED_GAP), within=part * deadline.left):
                 return pairs, refused
-        if deadline.left < _MIN_SERIES_SECONDS:
+        # Series need seconds to derive and compile, which the search does not count.
+        if deadline.left < 5.0:
             return pairs, refused
     # A series cannot follow jumps; runs follow them phase by phase.
     if not (motion.torque.callable or "jump" in motion.model.effects):
@@ -531,7 +525,8 @@ def _cut(motion: Motion, known: RunPair, agree: float) -> Reference:
     holds = relative <= agree
     n = len(holds) if holds.all() else int(np.argmin(holds))
     end = float(motion.save[n - 1])
-    worst = max(float(relative[:n].max()), _PAIR_RESOLUTION)
+    # A pair of doubles has 106 bits of a number that can be somewhat larger than the motion.
+    worst = max(float(relative[:n].max()), 2.0**-105)
     how = f"{known.how}, which agree to {worst:.1e} of the motion"
     if n < len(motion.save):
         why = known.why if n == len(q) else f"beyond, they part to {relative[n]:.1e} at t = {motion.save[n]:.6g} s"
@@ -553,7 +548,7 @@ def _cut(motion: Motion, known: RunPair, agree: float) -> Reference:
 
 def _accelerations_text(motion: Motion, best: Reference) -> str:
     """Return a text that compares accelerations along a motion with those of another engine."""
-    which = np.unique(np.linspace(0, len(best.t) - 1, min(_MAX_COMPARED_STATES, len(best.t))).astype(int))
+    which = np.unique(np.linspace(0, len(best.t) - 1, min(64, len(best.t))).astype(int))
     q, v = best.q[which], best.v[which]
     force, last = motion.torque.of_member(None), max(len(motion.stops) - 1, 0)
     tau = np.array([force(min(int(k), last)) for k in which])

@@ -25,8 +25,6 @@ from platformdirs import user_cache_path
 from mbkit._child_process import START_SECONDS
 from mbkit.errors import OutputError, UnknownNameError, UnsupportedError
 
-#: Seconds that pip may take.
-_INSTALL_SECONDS: Final = 1800.0
 #: Words of pip where a version does not exist, or where it reached no index.
 _VERSIONS: Final = re.compile(r"from versions: ([^)]*)\)")
 _NO_VERSION: Final = "there is no version of"
@@ -186,7 +184,7 @@ def _limit(path: Path, reason: str, limits: Sequence[str]) -> str:
 def _install(pip: Sequence[str], distribution: str, version: str, limits: Sequence[str], extra: str) -> None:
     wanted = f"{distribution}{extra}=={version}"
     # A compiler would take long, and versions without a wheel are rarely built by one.
-    done = _finished([*pip, "--only-binary=:all:", wanted, *limits], _INSTALL_SECONDS)
+    done = _finished([*pip, "--only-binary=:all:", wanted, *limits], 1800.0)
     if done.returncode == 0:
         return
     name = f"{distribution} {version}"

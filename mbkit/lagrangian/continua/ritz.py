@@ -50,7 +50,6 @@ class NormalModes:
 
 #: Digits of Ritz's matrices, enough for `MAX_MODES`: n powers cost 1.2 n of them. Shapes are written with fewer.
 _MATRIX_DIGITS: Final = 200
-_SHAPE_DIGITS: Final = 60
 #: A pivot is zero below this part of its diagonal entry.
 _ZERO_PIVOT_RATIO: Final = 1e-100
 
@@ -88,7 +87,7 @@ def normal_modes(system: Densities, count: int, values: Mapping[Any, float]) -> 
     names = [f.func.__name__ for f in system.jets.fields]
     shapes: list[Any] = []
     for mode in vectors:
-        own_shapes = [sp.Add(*(sp.Float(c, _SHAPE_DIGITS) * place**p for p, c in enumerate(rows))) for rows in mode]
+        own_shapes = [sp.Add(*(sp.Float(c, 60) * place**p for p, c in enumerate(rows))) for rows in mode]
         shapes.append(dict(zip(names, own_shapes, strict=True)) if len(names) > 1 else own_shapes[0])
     return NormalModes(np.sqrt(squares), tuple(shapes))
 

@@ -45,8 +45,6 @@ _SHADES: Final[dict[Outcome, str]] = {
 #: Outcomes whose words in a cell are others than their names.
 WORDS: Final[dict[Outcome, str]] = {"nan": "NaN", "not run": ""}
 _MARKS: Final[dict[Outcome, str]] = {"silent": "✗ ", "warned": "! ", "unjudged": "? "}
-#: More columns than these have no room for words.
-_MAX_ROOMY_COLUMNS: Final = 14
 _DASHED: Final = (0, (1.5, 1))
 
 
@@ -120,7 +118,8 @@ def _map(case: CaseResult, palette: Palette, given: Axes | None) -> Figure:
         for x, (cell, how) in enumerate(zip(line.row.cells[:count], line.outcomes, strict=False)):
             face, weight = SHADES[shade(cell, how)], "bold" if how == "silent" else "normal"
             ax.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=1.0))
-            text = cell_text(cell, how, short=count > _MAX_ROOMY_COLUMNS)
+            # More columns have no room for words.
+            text = cell_text(cell, how, short=count > 14)
             # Cells are light on every paper.
             ax.text(x, y, text, ha="center", va="center", fontsize=7.5, weight=weight, color=PLAIN.ink)
         if line.broken.failed is not None:

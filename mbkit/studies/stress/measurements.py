@@ -316,9 +316,8 @@ _clock = time.thread_time
 #: The time limit of making the problem and the engine and of compiling, over a run's; and its least.
 _PREPARATION_PER_RUN_TIME: Final = 15.0
 _MIN_PREPARATION_SECONDS: Final = 6.0
-#: A run shorter than this is timed so many times in all.
+#: A run shorter than this is timed three times in all.
 _SHORT_RUN_SECONDS: Final = 5e-3
-_SHORT_RUN_TIMINGS: Final = 3
 #: Methods that another may switch to, which are compiled before it is timed.
 _SWITCHES_TO: Final = {AUTOMATIC_METHOD: (ADAPTIVE_METHOD, STIFF_METHOD)}
 #: Steps of an engine's own integrator from which the time of all steps is estimated.
@@ -460,7 +459,7 @@ def _integrate(
             spent = [_clock() - begun]
     except TooLongError as error:
         return Measurement(0.0, "slow", note=str(error))
-    while spent[0] < _SHORT_RUN_SECONDS and len(spent) < _SHORT_RUN_TIMINGS:
+    while spent[0] < _SHORT_RUN_SECONDS and len(spent) < 3:
         begun = _clock()
         run(duration, method, save=times, doubt=False)
         spent.append(_clock() - begun)

@@ -40,15 +40,10 @@ from mbkit.studies.worker import CallError, Worker, WorkerPool, check_executor, 
 #: Seconds of a run and of the whole study, quick and not.
 _RUN_SECONDS: Final = {True: 0.5, False: 2.0}
 _STUDY_SECONDS: Final = {True: 100.0, False: 1700.0}
-#: Below it no worker starts, bytes.
-_MIN_WORKER_BYTES: Final = 2**29
-_MAX_JOBS: Final = 16
 #: A run is not begun with less time than this, s.
 _MIN_RUN_SECONDS: Final = 0.1
 #: A row is over after so many runs in a row that did not finish.
 _MAX_FAILURES_IN_A_ROW: Final = 2
-#: Seconds for terms with 34 digits at one value, for which there is no substitute.
-_TERMS_SECONDS: Final = 60.0
 #: Stage of a call -> what to add to the note of a process that ended there.
 _DURING: Final = {
     "": ", making the problem",
@@ -175,8 +170,9 @@ class CaseSweep:
                 return False
             self.report(f"{self.case.name}: truth at {self.case.parameter} = {value:g}")
             share = left / (len(self.values) - i)
-            # A search has the most of a truth's time, and making its engines some seconds besides.
-            seconds = _TERMS_SECONDS if self.case.measure == "terms" else share + 2.0
+            # Terms with 34 digits have no substitute. A search has the most of a truth's time, and making its engines
+            # some seconds besides.
+            seconds = 60.0 if self.case.measure == "terms" else share + 2.0
             answer = self._call(worker, value, prepare, self.bar, 0.7 * share, truth=seconds)
             if isinstance(answer, Measurement):
                 answer = Prepared(f"no truth: {answer.note}") if worker.stage else Prepared(answer.note, failure=answer)
@@ -408,9 +404,10 @@ def stress(
         real("rtol", rtol, positive=True),
     )
     bar = real("bar", bar, positive=True)
-    memory = 2 * 2**30 if memory is None else count("memory", memory, least=_MIN_WORKER_BYTES)
+    # No worker starts with less.
+    memory = 2 * 2**30 if memory is None else count("memory", memory, least=2**29)
     budget = _STUDY_SECONDS[quick] if budget is None else real("budget", budget, positive=True)
-    width = min(cores(), _MAX_JOBS) if jobs is None else count("jobs", jobs, least=1)
+    width = min(cores(), 16) if jobs is None else count("jobs", jobs, least=1)
     check_executor(executor)
     if executor is not None and jobs is not None:
         raise InputError("jobs: expected none beside an executor, which has its own; leave it out")

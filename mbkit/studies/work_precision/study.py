@@ -29,19 +29,8 @@ from mbkit.studies.worker import check_executor
 #: An exact motion: from a time to q and v.
 Exact = Callable[[float], tuple[ArrayLike, ArrayLike]]
 
-#: The usual seconds of a study: base, for each velocity, and at the most.
-_BASE_SECONDS: Final = 60.0
-_SECONDS_PER_VELOCITY: Final = 10.0
-_MAX_USUAL_SECONDS: Final = 120.0
-#: The limit of a study without `seconds`, over its usual time.
-_LIMIT_PER_USUAL_TIME: Final = 5.0
-#: Evaluations of a run at the most; fewer beyond so many velocities, where an evaluation takes longer.
+#: Evaluations of a run at the most.
 _MAX_EVALUATIONS: Final = 200_000
-_MAX_VELOCITIES_AT_FULL_WORK: Final = 8
-#: The least part of the usual time, for a study of less work.
-_MIN_USUAL_PART: Final = 0.1
-#: The part of the usual time that the search of a reference has.
-_REFERENCE_PART: Final = 0.25
 _ALONE: Final = "interleaved in one process"
 _TOGETHER: Final = "by workers that share the cores: errors are the same, run times are not those of a quiet machine"
 
@@ -144,12 +133,14 @@ def work_precision(
     """
     begun = time.perf_counter()
     require_motion(model, "integrate").require_values("a study of run time")
-    usual = min(_BASE_SECONDS + _SECONDS_PER_VELOCITY * model.nv, _MAX_USUAL_SECONDS)
-    limit = _LIMIT_PER_USUAL_TIME * usual if seconds is None else real("seconds", seconds, positive=True)
-    whole = _MAX_EVALUATIONS * min(1.0, _MAX_VELOCITIES_AT_FULL_WORK / model.nv)
+    # The usual seconds of a study: a base, and some for each velocity.
+    usual = min(60.0 + 10.0 * model.nv, 120.0)
+    limit = 5.0 * usual if seconds is None else real("seconds", seconds, positive=True)
+    # With more velocities an evaluation takes longer.
+    whole = _MAX_EVALUATIONS * min(1.0, 8 / model.nv)
     most = whole if work is None else count("work", work, least=1)
     # Studies with a small limit of work time their runs less often, the longest least.
-    budget = TimeBudget(limit, min(usual * min(max(most / whole, _MIN_USUAL_PART), 1.0), limit), most)
+    budget = TimeBudget(limit, min(usual * min(max(most / whole, 0.1), 1.0), limit), most)
     repeats, seed = count("repeats", repeats, least=1), count("seed", seed)
     check_executor(executor, torque=torque)
     checkpoints = Checkpointer(progress, checkpoint)
@@ -165,7 +156,7 @@ def work_precision(
     start = _start(integrated, (q0, v0), seed, known)
     if known is None:
         known = _computed_reference(
-            *(integrated, *start, asked, force, _REFERENCE_PART * min(usual, limit)),
+            *(integrated, *start, asked, force, 0.25 * min(usual, limit)),
             lambda done: checkpoints.report(0.1 * done, "reference"),
         )
     truth = _truth(integrated, start[0], asked, known)
