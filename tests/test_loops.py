@@ -258,7 +258,7 @@ def test_a_body_that_a_loop_holds_begins_to_move_as_newton_and_euler_say(kind):
     assert a == pytest.approx(expected[[0, 1, 2, 5, 4, 3]], abs=1e-12)
 
 
-@pytest.mark.thorough("universal", "prismatic", "point", "revolute")
+@pytest.mark.thorough("universal", "prismatic", "point", "revolute", "distance")
 @pytest.mark.parametrize("kind", LOOP_KINDS)
 def test_every_kind_of_loop_has_the_rows_and_accelerations_of_the_engine(kind):
     model = loose(kind)

@@ -42,7 +42,7 @@ def against_34_digits(model: mb.Model, q: np.ndarray, seed: int, solver: str) ->
     assert (dyn._iterated(q, v, tau) is not None) is (solver == "constraintDynamics")
 
 
-@pytest.mark.thorough("point", "frame", "universal", "revolute")
+@pytest.mark.thorough("point", "frame", "universal", "revolute", "distance")
 @pytest.mark.parametrize("kind", LOOP_KINDS)
 def test_both_ways_to_accelerations(kind):
     model, q = MODELS[f"loop.{kind}"]()

@@ -30,7 +30,7 @@ OF_ROWS = [x for x in of_groups("row") if x.startswith(("constraint_r", "constra
 @pytest.mark.thorough(
     *("revolute", "continuous", "prismatic", "spherical_zyx", "ball", "planar", "cylindrical", "without springs"),
     *("free", "universal", "loop.revolute", "loop.prismatic", "loop.cylindrical", "loop.distance", "planar_3rrr"),
-    *("loop.universal", "solo12", "flyball_governor"),
+    *("loop.universal", "loop.point", "solo12", "flyball_governor"),
 )
 @pytest.mark.parametrize("name", MODELS)
 def test_each_quantity_is_right_or_refused(name):

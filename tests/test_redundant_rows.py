@@ -171,7 +171,7 @@ def without(basis: list[tuple[int, mp.matrix]], y: mp.matrix) -> mp.matrix:
     return y
 
 
-@pytest.mark.thorough(every=251)
+@pytest.mark.thorough(every=501)
 @pytest.mark.parametrize("seed", range(1000))
 def test_accelerations_keep_what_the_condition_of_the_rows_leaves(seed: int) -> None:
     mechanism = Mechanism(seed)
@@ -223,7 +223,7 @@ def swing(theta: float, tau: float = 0.0) -> float:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("apart", [1e-1, 1e-6, 1e-8, 1e-9, 1e-11])
+@pytest.mark.parametrize("apart", [1e-1, 1e-8, 1e-11])
 def test_cranks_that_differ_by_little_do_not_move(engine: str, apart: float) -> None:
     dyn = mb.dynamics(cranks(apart), engine)
     q = np.array([THETA, THETA, THETA + apart, -THETA])

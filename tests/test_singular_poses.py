@@ -468,7 +468,7 @@ class KiteMotion:
 PLACES = [0.3, *(c + x for c in (0.0, 0.5, 1.0, 0.5 - 3**0.5 / 6, 0.5 + 0.15**0.5) for x in (1e-3, -1e-6, 1e-9, 0.0))]
 
 
-@pytest.mark.thorough(every=41)
+@pytest.mark.thorough(every=67)
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize(
     ("method", "close"),

@@ -148,7 +148,7 @@ def every_kind() -> tuple[Any, ...]:
     return model, given, save, simulate(*given, "dop853", rtol=1e-12, save=save)
 
 
-@pytest.mark.thorough("radau")
+@pytest.mark.thorough("radau", "bdf")
 @pytest.mark.parametrize("method", IMPLICIT)
 def test_every_joint_kind_moves_as_with_dop853(method: str, every_kind: tuple[Any, ...]) -> None:
     model, given, save, truth = every_kind

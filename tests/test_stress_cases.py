@@ -85,6 +85,7 @@ FAST = {c.name: c.quick[1] for c in MOTIONS if c.family not in _APART and c.name
 FAST["gimbal_pass"] = 1e-2
 
 
+@pytest.mark.thorough(every=2)
 @pytest.mark.parametrize("case", [c for c in MOTIONS if c.name in FAST], ids=ids)
 def test_exact_motions_satisfy_the_equation_of_motion(case: Case) -> None:
     """M(q) q̈ + nle - τ_passive of the differentiated closed form, beside the size of its parts."""
@@ -133,7 +134,7 @@ def test_starts_are_consistent(case: Case) -> None:
         assert np.linalg.eigvalsh(scaled)[0] > 0
 
 
-@pytest.mark.thorough("neck", "bricard_turned", "delta_robot")
+@pytest.mark.thorough("neck", "bennett", "bricard_turned", "delta_robot")
 @pytest.mark.parametrize("name", ["cranks", "neck", "bennett", "bricard_turned", "delta_robot"])
 def test_nearly_redundant_loops_lose_digits_with_their_condition(name: str) -> None:
     case, scales = cases.get(name), []

@@ -274,6 +274,7 @@ def test_a_state_that_grows_beyond_all_bounds_is_told(compile: bool) -> None:  #
     assert run.stats.reached == 4.0
 
 
+@pytest.mark.thorough("random tree")
 @pytest.mark.parametrize("case", cases())
 def test_time_can_be_turned_back(case: str) -> None:
     model, q, v, duration = cases()[case]

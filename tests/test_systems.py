@@ -25,7 +25,7 @@ def off(x, y, scale=0.0):
     return float(np.linalg.norm(np.asarray(x) - y) / max(np.linalg.norm(y), scale, 1e-300))
 
 
-@pytest.mark.thorough(every=6)
+@pytest.mark.thorough(every=10)
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "mujoco"])
 @pytest.mark.parametrize("name", [name for name in TWINS if not name.startswith("weightless")])
 def test_paper_is_the_model_in_every_engine(name, engine):

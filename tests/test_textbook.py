@@ -109,7 +109,7 @@ def states(model: Model, count: int = 6) -> list[tuple[np.ndarray, np.ndarray]]:
 # Terms
 
 
-@pytest.mark.thorough(every=2)
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("name", ENGINES)
 @pytest.mark.parametrize("case", CASES)
 def test_engines_agree_with_closed_forms(case: str, name: str) -> None:
