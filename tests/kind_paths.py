@@ -33,6 +33,7 @@ from mbkit.model.elements.kinds import PART_KINDS, kind
 from mbkit.model.elements.paths import PATHS as GATES
 from mbkit.simulate import Event
 from mbkit.studies.baseline.file import Rollout
+from mbkit.studies.explain import Motion
 from tests import kind_examples
 from tests.fake_cuda import fake_gpu
 from tests.kind_examples import EXAMPLES, TYPES, Arm, Example, example
@@ -963,15 +964,20 @@ def without_part(x: Example) -> Model | None:
     return x.model.without(x.name) if k and k.features else None
 
 
+def bare(x: Example) -> Example:
+    """The example without its part."""
+    parts = [] if x.name != "gravity" else x.plain.parts
+    weight = 0 * x.plain.weight if x.name == "gravity" else x.plain.weight
+    return replace(x, plain=replace(x.plain, parts=parts, weight=weight))
+
+
 @column("changes", "without")
 def _taken_out(x: Example, folder: Path) -> Told:
     less = without_part(x)
     if less is None:
         raise NotAskedError("it is no part that can be taken out")
-    parts = [] if x.name != "gravity" else x.plain.parts
-    weight = 0 * x.plain.weight if x.name == "gravity" else x.plain.weight
-    bare = replace(x, plain=replace(x.plain, parts=parts, weight=weight))
-    return off(mb.dynamics(less, "lagrangian", compile=False).forward_dynamics(x.q, x.v, x.tau), bare.accelerated())
+    own = mb.dynamics(less, "lagrangian", compile=False)
+    return off(own.forward_dynamics(x.q, x.v, x.tau), bare(x).accelerated())
 
 
 @column("changes", "lock", "lock")
@@ -1037,6 +1043,24 @@ def _explained(x: Example, folder: Path) -> Told:
     if not named(x.name, x, text):
         raise AssertionError(f"not by name: {text}")
     return 0.0
+
+
+@column("studies", "motions of causes", "motions", close=1e-6)
+def _moved(x: Example, folder: Path) -> Told:
+    """The motion with the part and without it, passive, beside both by SciPy."""
+    if (less := without_part(x)) is None:
+        raise NotAskedError("it is no part that can be taken out")
+    motion = Motion(controller="passive", q=x.q, v=x.v, times=(DURATION,))
+    one, other = (replace(m, time=x.t) for m in (x.model, less))
+    out = mb.explain(one, other, samples=1, motion=motion).motion
+    assert out is not None
+    alone = [e.largest for e in out.effects]
+    if out.whole[0] > 1e-9 and not alone:
+        raise AssertionError("no cause of a difference")
+    ends = [y.flow([DURATION], lambda t, q, v: 0 * v)[-1] for y in (x, bare(x))]
+    apart = np.abs(x.model.difference(*(y.state(end)[0] for y, end in zip((x, bare(x)), ends, strict=True)))).max()
+    soft = [n for n in out.notes if "soft" in n]
+    return max(abs(out.whole[0] - apart), out.unexplained[0]), soft
 
 
 @column("studies", "explain: each number")

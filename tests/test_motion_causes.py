@@ -181,6 +181,10 @@ def test_contacts_of_a_file_are_named_as_not_compared(tmp_path: Path) -> None:
     path.write_text(ARM.replace("<worldbody>", '<worldbody><geom type="plane" size="1 1 .1"/>'))
     _, left = file_settings(path, mb.load(path))
     assert left == ("contacts of 1 shape",)
+    soft = ARM.replace('range="-170 170"', 'range="-170 170" solreflimit="0.01 1" margin="0.1"')
+    path.write_text(soft.replace('frictionloss="0.02"', 'frictionloss="0.02" solreffriction="0.01 1"'))
+    _, left = file_settings(path, mb.load(path))
+    assert left == ("the softness of joint limits", "the softness of dry friction", "the margin of joint limits")
 
 
 def test_orders_base_frames_and_joints_of_one_side_alone_are_causes() -> None:

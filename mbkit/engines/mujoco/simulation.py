@@ -45,6 +45,7 @@ def settings_of(text: str, files: dict[str, bytes], joints: set[str]) -> tuple[S
         left.append(f"contacts of {len(touching)} shape{'s' * (len(touching) != 1)}")
     if m.opt.density or m.opt.viscosity:
         left.append("forces of a medium")
+    left += _softness(m, limits="LIMIT" not in off)
     held = Settings(
         engine="mujoco",
         integrator=names.get(m.opt.integrator, "mujoco_euler"),
@@ -57,6 +58,25 @@ def settings_of(text: str, files: dict[str, bytes], joints: set[str]) -> tuple[S
         servos=tuple(servos),
     )
     return held, left
+
+
+def _softness(m: Any, *, limits: bool) -> list[str]:
+    """Return which constraints have another softness than MuJoCo's own, which a description does not hold."""
+    usual = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><joint/><geom size='1'/></body></worldbody></mujoco>"
+    )
+    kinds = {
+        "joint limits": ("jnt_solref", "jnt_solimp", m.jnt_limited.astype(bool) & limits),
+        "dry friction": ("dof_solref", "dof_solimp", m.dof_frictionloss > 0),
+        "equality constraints": ("eq_solref", "eq_solimp", m.eq_active0.astype(bool)),
+    }
+    out = []
+    for what, (*names, acts) in kinds.items():
+        own = {n: usual.dof_solref if "ref" in n else usual.dof_solimp for n in names}
+        if any(np.any(getattr(m, n)[acts] != x[0]) for n, x in own.items()):
+            out.append(f"the softness of {what}")
+    margin = m.jnt_margin[m.jnt_limited.astype(bool)] if limits else np.zeros(0)
+    return [*out, *(["the margin of joint limits"] if margin.any() else [])]
 
 
 def _bit(name: str) -> int:

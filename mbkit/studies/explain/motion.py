@@ -7,7 +7,7 @@ alone out of the second; how far the motion changes by that is its effect, in ra
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final
@@ -22,7 +22,10 @@ from mbkit.engines.simulation_settings import WORDS, Settings
 from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, TorqueError, UnsupportedError
 from mbkit.methods.registry import METHODS, method_of
 from mbkit.model import Model
+from mbkit.model.elements.kinds import EFFECTS, PART_KINDS
+from mbkit.model.elements.paths import Path as Gate
 from mbkit.model.joint_types import JointType
+from mbkit.model.validation import model_faults
 from mbkit.simulate import simulate
 from mbkit.simulate.progress import Bar
 from mbkit.studies.explain.hypotheses import Hypothesis
@@ -32,6 +35,21 @@ from mbkit.studies.explain.motion_result import CauseMotion, MotionComparison
 from mbkit.studies.explain.worlds import World, joint_order, setting_differences
 from mbkit.studies.results import counted
 
+#: Kinds that stand on a single link, which is fused with others before motions are compared.
+_OF_LINKS: Final = ("body.rotor", "force.compensation", "force.compensation.partial")
+
+
+def _fused(model: Model) -> Iterator[str]:
+    some = (PART_KINDS[name] for name in _OF_LINKS if name in model.acts)
+    yield from (k.words.format(p=p) + ", which is lost where links are fused" for k in some for p in k.parts(model))
+
+
+MOTIONS: Final = Gate(
+    "motions",
+    "motions are compared of descriptions whose fixed links are fused, without",
+    frozenset(EFFECTS),
+    also=_fused,
+)
 #: u(t, q, v) -> (nv,): what the servo of each velocity takes, or its torque.
 Controller = Callable[[float, Array, Array], ArrayLike]
 #: What a simulation is run with where neither side says it.
@@ -220,13 +238,11 @@ class Runner:
         else:
             dyn, method = _engine(model, str(settings.engine)), str(settings.integrator)
             setting = {"rtol": _RTOL} if method_of(method).kind == "adaptive" else {"dt": settings.time_step}
-            more: dict[str, Any] = (
-                {} if law is None else {"torque": _with_servos(law, model, settings), "hold": settings.control_period}
-            )
+            more: dict[str, Any] = {"t0": model.time, "save": model.time + self.grid, "doubt": False}
+            if law is not None:
+                more |= {"torque": _with_servos(law, model, settings), "hold": settings.control_period}
             try:
-                run = simulate(
-                    dyn, q0, v0, float(self.grid[-1]), method, save=self.grid, doubt=False, **setting, **more
-                )
+                run = simulate(dyn, q0, v0, float(self.grid[-1]), method, **setting, **more)
             except TorqueError as error:
                 raise InputError(f"controller: {error}") from error
             full, why = layout.expand_q(run.q), run.stats.message
@@ -309,7 +325,8 @@ def _with_servos(law: Controller, model: Model, settings: Settings) -> Controlle
     servos = [(x, layout.q[x.joint].start, layout.v[x.joint].start) for x in settings.servos or ()]
 
     def torque(t: float, q: Array, v: Array) -> Array:
-        out = np.array(law(t, q, v), dtype=np.float64)
+        # A controller counts from the start.
+        out = np.array(law(t - model.time, q, v), dtype=np.float64)
         for servo, i, k in servos:
             out[k] = servo.torque(out[k], q[i], v[k])
         return out
@@ -327,6 +344,7 @@ class Compared:
     `alike` are both with the same joints and frames, in which the `regular` differences stand; `read` are both as they
     were read, the second in the first's names. `bases` are differences in the frames of free bodies, `alone` those in
     the joints themselves. `order` has the joints of the second, in its own names and order.
+    Motions begin at `time`, s.
     """
 
     alike: tuple[MergedModel, MergedModel]
@@ -336,9 +354,10 @@ class Compared:
     alone: tuple[Hypothesis, ...]
     matching: Matching
     order: tuple[str, ...]
+    time: float
 
     def worlds(self, settings: tuple[Settings, Settings]) -> tuple[World, World]:
-        """Return both sides in like frames."""
+        """Return both sides in like frames, at the first's time."""
         name = {m.b: m.a for m in self.matching.pairs}
         held = (replace(x, joint=name[x.joint]) for x in settings[1].servos or () if x.joint in name)
         second = replace(settings[1], servos=None if settings[1].servos is None else tuple(held))
@@ -346,7 +365,8 @@ class Compared:
             tuple(j.name for j in self.alike[0].model.independent_joints),
             tuple(name[n] for n in self.order if n in name),
         )
-        one, other = (World(*x) for x in zip(self.alike, (settings[0], second), orders, strict=True))
+        timed = (x.put(("",), {"time": self.time}) for x in self.alike)
+        one, other = (World(*x) for x in zip(timed, (settings[0], second), orders, strict=True))
         return one, other
 
 
@@ -356,6 +376,8 @@ def compare_motions(compared: Compared, motion: Motion, names: tuple[str, str]) 
     unsaid = _unsaid(first.settings, second.settings, names)
     first, second, notes = runnable(first, second)
     settings = setting_differences(first.settings, second.settings)
+    if any(w.settings.engine == DEFAULTS.engine and "jump" in w.system.model.effects for w in (first, second)):
+        notes.append("dry friction is soft in these runs, as it is in MuJoCo")
     causes = [*compared.regular, *settings, *joint_order(first, second)]
     # As they were read, with frames of free bodies and with joints that one side has alone.
     framed = second
@@ -364,7 +386,7 @@ def compare_motions(compared: Compared, motion: Motion, names: tuple[str, str]) 
     wholes = [first, framed]
     for k, only in enumerate((compared.matching.only_a, compared.matching.only_b)):
         if only:
-            wholes[k] = replace(wholes[k], system=compared.read[k])
+            wholes[k] = replace(wholes[k], system=compared.read[k].put(("",), {"time": compared.time}))
     runner = Runner(first, motion, names[1])
     found = list[CauseMotion]()
     with Bar("motions") as bar:
@@ -414,9 +436,13 @@ def compare_motions(compared: Compared, motion: Motion, names: tuple[str, str]) 
 
 
 def _measured(runner: Runner, world: World, change: Callable[[Any], Any]) -> tuple[Array, list[str]] | None:
-    """Return how far a change moves a world; None where the changed one cannot be run."""
+    """Return how far a change moves a world; None where the changed one cannot be, or cannot be run."""
+    changed = change(world)
+    # One number of several may not be changed alone, such as a Stribeck velocity without stiction.
+    if {*model_faults(changed.system.model)} - {*model_faults(world.system.model)}:
+        return None
     try:
-        return runner.apart(world, change(world))
+        return runner.apart(world, changed)
     except (UnsupportedError, ArithmeticError):
         return None
 

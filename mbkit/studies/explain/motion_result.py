@@ -45,6 +45,11 @@ class CauseMotion:
         return tuple(np.fmax(self.alone, self.without).tolist())
 
     @property
+    def measured(self) -> bool:
+        """Whether a run could be made with this cause alone, or without it."""
+        return not all(map(math.isnan, self.at_times))
+
+    @property
     def largest(self) -> float:
         """The largest change at any time of the comparison."""
         return float(np.nanmax([0.0, *self.at_times]))
@@ -110,7 +115,8 @@ class MotionComparison(ResultTable):
     def sections(self) -> list[Section]:
         """Return the sections of a document."""
         numbered = [(k, x) for k, x in enumerate(self.effects, 1) if x.largest != 0]
-        still = [f"{k}. {x}" for k, x in enumerate(self.effects, 1) if x.largest == 0]
+        zero = [(k, x) for k, x in enumerate(self.effects, 1) if x.largest == 0]
+        still, unknown = ([f"{k}. {x}" for k, x in zero if x.measured is known] for known in (True, False))
         rows = [
             ("both sides as they are", self.whole, math.nan, ""),
             *((f"{k}. {x}", x.at_times, x.passes, x.joint) for k, x in numbered),
@@ -137,6 +143,7 @@ class MotionComparison(ResultTable):
             *(Bullet(name, text) for name, text in zip((self.a, self.b), self.settings, strict=True)),
             *(Bullet("not compared", x) for x in self.not_compared),
             *([Bullet("moved nothing in these runs", listing(still, MAX_NAMES))] if still else []),
+            *([Bullet("not measured alone", listing(unknown, MAX_NAMES))] if unknown else []),
             *(Bullet("", x) for x in self.notes),
         ]
         return [Section("What each cause does to the motion, rad or m", [table]), Section("Runs", [Items(says)])]

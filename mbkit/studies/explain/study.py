@@ -35,7 +35,7 @@ from mbkit.studies.explain.joint_matching import (
     rename_joints,
 )
 from mbkit.studies.explain.merged_model import MergedModel, Tolerances, merge, number_text, with_common_frames
-from mbkit.studies.explain.motion import Compared, Motion, compare_motions, with_engines
+from mbkit.studies.explain.motion import MOTIONS, Compared, Motion, compare_motions, with_engines
 from mbkit.studies.explain.records import compare_records
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.terms import WHOLE, Gap, Gaps, effects, larger, model_terms, states_of, worst
@@ -106,9 +106,12 @@ def explain(
         one, other = (replace(x, time=_moment(model_a, model_b)) for x in (model_a, model_b))
         own = [x.engine if isinstance(x, Dynamics) else x.name for x in (a, b)]
         names = names or ((own[0], own[1]) if own[0] != own[1] else ("first", "second"))
-        study = _Descriptions(one, other, names, samples, seed, tolerance)
+        study = _Descriptions(one, other, names, samples, seed, tolerance, model_a.time)
         out = study.explain()
         out = engine_causes(a, b, out) if isinstance(a, Dynamics) or isinstance(b, Dynamics) else out
+        if motion or rollouts is not None:
+            MOTIONS.admit(model_a)
+            MOTIONS.admit(model_b)
         if rollouts is not None:
             how = with_engines(motion if isinstance(motion, Motion) else Motion(), a, b)
             return replace(out, records=compare_records(study.compared, how, rollouts, names))
@@ -147,6 +150,7 @@ class _Descriptions:
     samples: int
     seed: int
     tolerance: float
+    time: float
     compared: Compared = field(init=False)
 
     def explain(self) -> Explanation:
@@ -179,7 +183,9 @@ class _Descriptions:
         )
         read = wholes[0], rename_joints(wholes[1], one.model, matching)
         order = tuple(j.name for j in other.model.independent_joints)
-        self.compared = Compared((one, target), read, (*hypotheses,), (*bases,), (*structural,), matching, order)
+        self.compared = Compared(
+            (one, target), read, (*hypotheses,), (*bases,), (*structural,), matching, order, self.time
+        )
         acting = [c.kind for c in causes if c.acts]
         massless = bool(one.model.nv) and self._is_massless(one.model) and self._is_massless(target.model)
         found = larger(before, self._large(whole), *(more for _, more in held)) if before else ()
