@@ -311,6 +311,11 @@ def test_records_that_cannot_be_compared_are_refused(tmp_path: Path) -> None:
     lost = {"t": run["t"], "shoulder": run["qpos"][:, 0], "elbow": run["qpos"][:, 1]}
     with pytest.raises(InputError, match="no column of wrist"):
         mb.explain(model, model, rollouts=(run, lost), motion=held)
+    with pytest.raises(InputError, match="expected two records"):
+        mb.explain(model, model, rollouts=(run,), motion=held)
+    for wrong in ({"times": (1.0, 0.5)}, {"bound": 0.0}, {"seed": -1}, {"q": [[0.0] * 3] * 2}, {"times": ()}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            Motion(**wrong)
     with pytest.raises(InputError, match="column t or time"):
         record_of({"x": run["t"]}, model)
 

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, finite_array, real
+from mbkit._check import Array, count, finite_array, real
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.engines.simulation_settings import WORDS, Settings
@@ -115,6 +115,10 @@ class Motion:
         if not len(times) or not (np.diff([0.0, *times]) > 0).all():
             raise InputError(f"times: expected increasing times after 0 s, got {self.times}")
         real("bound", self.bound, positive=True)
+        count("seed", self.seed)
+        for name, x in (("q", self.q), ("v", self.v)):
+            if x is not None and np.ndim(x) != 1:
+                raise InputError(f"{name}: expected one state, (n,), got shape {np.shape(x)}")
         if isinstance(self.controller, str) and self.controller not in ("posture", "passive"):
             expected = "'posture', 'passive', a function of (t, q, v) or a table"
             raise InputError(f"controller: expected {expected}, got {self.controller!r}")
@@ -153,14 +157,17 @@ class Runner:
 
     def _start(self, model: Model) -> tuple[Array, Array]:
         motion, rng = self.motion, np.random.default_rng(self.motion.seed)
-        if model.constrained and motion.q is None:
+        q, v = model.neutral(), _SPEED * rng.standard_normal(model.nv)
+        if motion.q is not None:
+            # A velocity that fits a given configuration under constraints is not known, but rest does.
+            q, v = model.check_q(motion.q, "q"), np.zeros(model.nv) if model.constrained else v
+        elif model.constrained:
             q, v = model.random_state(rng)
+            v = _SPEED * v
         else:
-            q, v = model.neutral(), rng.standard_normal(model.nv)
             for rows, low, high in _bounds(model):
                 q[rows] = np.clip(q[rows], 0.9 * low + 0.1 * high, 0.1 * low + 0.9 * high)
-        q = q if motion.q is None else model.check_q(motion.q, "q")
-        return q, _SPEED * v if motion.v is None else model.check_v(motion.v, "v")
+        return q, v if motion.v is None else model.check_v(motion.v, "v")
 
     def _controller(self, first: World, q: Array) -> tuple[Controller | None, str]:
         """Return the control law and a sentence on it."""

@@ -204,6 +204,8 @@ def compare_records(
     compared: Compared, motion: Motion, records: tuple[Any, Any], names: tuple[str, str]
 ) -> RecordComparison:
     """Run the first side from the records' start, with each known cause and each pair of them, beside the second's."""
+    if not isinstance(records, (tuple, list)) or len(records) != 2:
+        raise InputError(f"rollouts: expected two records, got {type(records).__name__}")
     first, second = compared.worlds((motion.settings[0] or Settings(), motion.settings[1] or Settings()))
     first, second, notes = runnable(first, second)
     known = [
