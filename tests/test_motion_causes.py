@@ -15,8 +15,8 @@ from click.testing import CliRunner
 import mbkit as mb
 from mbkit import spatial
 from mbkit.cli import cli
+from mbkit.engines.mujoco.settings import WORDS
 from mbkit.engines.mujoco.simulation import OwnSimulation
-from mbkit.engines.simulation_settings import WORDS
 from mbkit.errors import InputError, OutputError, UnsupportedError
 from mbkit.studies.explain import Explanation, Motion, Servo, Settings, file_settings, record_of
 from mbkit.studies.explain.worlds import setting_differences

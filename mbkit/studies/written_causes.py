@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
-from mbkit.engines.simulation_settings import Settings
+from mbkit.engines.mujoco.settings import Settings
 from mbkit.errors import InputError, MbkitError, OutputError
 from mbkit.studies.convert import convert
 from mbkit.studies.explain.merged_model import MergedModel

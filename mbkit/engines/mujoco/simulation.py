@@ -13,7 +13,7 @@ from mbkit._check import Array
 from mbkit.engines.mujoco.engine import INTEGRATORS, _turned
 from mbkit.engines.mujoco.mjcf_writer import mjcf_text
 from mbkit.engines.mujoco.model import heard_warnings, mapped, specified
-from mbkit.engines.simulation_settings import Servo, Settings
+from mbkit.engines.mujoco.settings import Servo, Settings
 from mbkit.model import Model
 
 _SOLVERS: Final = {int(getattr(mujoco.mjtSolver, f"mjSOL_{x}")): x.lower() for x in ("PGS", "CG", "NEWTON")}

@@ -1,6 +1,6 @@
 """Why two descriptions, importers or engines differ."""
 
-from mbkit.engines.simulation_settings import Servo, Settings
+from mbkit.engines.mujoco.settings import Servo, Settings
 from mbkit.studies.explain.motion import Motion, file_settings
 from mbkit.studies.explain.motion_result import CauseMotion, MotionComparison, RecordComparison
 from mbkit.studies.explain.records import record_of

@@ -18,9 +18,10 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, count, finite_array, real
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.engines.simulation_settings import WORDS, Settings
+from mbkit.engines.mujoco.settings import WORDS, Settings
+from mbkit.engines.registry import ENGINES, MUJOCO, PINOCCHIO
 from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, TorqueError, UnsupportedError
-from mbkit.methods.registry import METHODS, method_of
+from mbkit.methods.registry import METHODS, SCIPY_METHOD, method_of
 from mbkit.model import Model
 from mbkit.model.elements.kinds import EFFECTS, PART_KINDS
 from mbkit.model.elements.paths import Path as Gate
@@ -53,9 +54,9 @@ MOTIONS: Final = Gate(
 #: u(t, q, v) -> (nv,): what the servo of each velocity takes, or its torque.
 Controller = Callable[[float, Array, Array], ArrayLike]
 #: What a simulation is run with where neither side says it.
-DEFAULTS: Final = Settings("mujoco", "mujoco_rk4", 1e-3, True, "newton", 100, 1e-8, False, (), 1e-2)
+DEFAULTS: Final = Settings(MUJOCO, ENGINES[MUJOCO].rk4, 1e-3, True, "newton", 100, 1e-8, False, (), 1e-2)
 #: Engine and method where MuJoCo cannot hold a description as it is.
-EXACT: Final = ("pinocchio", "dop853")
+EXACT: Final = (PINOCCHIO, SCIPY_METHOD)
 #: Bandwidth of the controller that holds a posture, rad/s.
 _BANDWIDTH: Final = 10.0
 #: Distance of the posture from the start, rad or m, and the size of the starting velocities, rad/s or m/s.
@@ -191,7 +192,7 @@ class Runner:
     def _posture(self, first: World, q: Array) -> tuple[Controller, str]:
         """Return a law that holds a posture: targets of servos, or torques of a PD controller."""
         model, settings, rng = first.system.model, first.settings, np.random.default_rng([self.motion.seed, 1])
-        felt = 1.0 / np.diag(np.linalg.inv(_engine(model, "pinocchio").mass_matrix(q)))
+        felt = 1.0 / np.diag(np.linalg.inv(_engine(model, EXACT[0]).mass_matrix(q)))
         target, kp, kd, at = *np.zeros((3, model.nv)), np.zeros(model.nv, int)
         gains, servos = list[str](), list[str]()
         layout = model.layout
@@ -233,7 +234,7 @@ class Runner:
         for name in (n for n in free if n in self.q):
             q0[layout.q[name]], v0[layout.v[name]] = self.q[name], self.v[name]
         law = self._in_order(world)
-        if settings.engine == "mujoco":
+        if settings.engine == MUJOCO:
             from scipy.interpolate import CubicSpline
 
             from mbkit.engines.mujoco.simulation import OwnSimulation

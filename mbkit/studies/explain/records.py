@@ -13,8 +13,10 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array, finite_array
-from mbkit.engines.simulation_settings import Settings
+from mbkit.engines.mujoco.settings import Settings
+from mbkit.engines.registry import MUJOCO
 from mbkit.errors import InputError, MbkitError
+from mbkit.methods.registry import METHODS
 from mbkit.model import Model
 from mbkit.model.elements.kinds import PART_KINDS
 from mbkit.simulate import Trajectory
@@ -175,7 +177,7 @@ def usual_causes(model: Model, settings: Settings, period: float) -> Iterator[Hy
     """
     steps = sorted({*_STEPS, *(float(f"{period / k:.6g}") for k in _ROWS_IN_PERIOD)})
     choices: dict[str, Sequence[Any]] = {"time_step": steps, "implicit_damping": (True, False)}
-    choices["integrator"] = [f"mujoco_{x}" for x in ("euler", "implicitfast", "rk4")]
+    choices["integrator"] = [m.name for m in METHODS.values() if m.kind == "native" and m.engines and m.on(MUJOCO)]
     for name, values in choices.items():
         for value in values:
             yield from setting_differences(settings, replace(settings, **{name: value}))

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar, cast
 
-from mbkit.engines.simulation_settings import WORDS, Servo, Settings
+from mbkit.engines.mujoco.settings import WORDS, Servo, Settings
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.model import Model
 from mbkit.studies.explain.hypotheses import Change, Hypothesis
