@@ -276,6 +276,15 @@ def test_two_records_of_mj_step_are_explained(tmp_path: Path, kinds: tuple[str, 
     assert found.joint in models[0].joint_names
 
 
+def test_a_record_that_was_made_with_another_step_than_its_file_says(tmp_path: Path) -> None:
+    models, settings = read(tmp_path, ARM, edited("damping"))
+    pairs = bare(ARM), bare(edited("damping", "time step"))
+    motion = Motion(controller=lambda *_: CONTROL, settings=(settings[0], settings[1]))
+    found = mb.explain(*models, rollouts=pairs, motion=motion).records
+    assert sorted(found.kinds) == ["damping", "time step"]
+    assert found.residual < 1e-11
+
+
 def test_records_by_the_names_of_joints(tmp_path: Path) -> None:
     (model,), _ = read(tmp_path, ARM)
     run = bare(ARM)

@@ -210,13 +210,13 @@ def compare_records(
         raise InputError(f"rollouts: expected two records, got {type(records).__name__}")
     first, second = compared.worlds((motion.settings[0] or Settings(), motion.settings[1] or Settings()))
     first, second, notes = runnable(first, second)
-    known = [
+    told = [
         *compared.regular,
         *compared.bases,
         *setting_differences(first.settings, second.settings),
         *joint_order(first, second),
     ]
-    model = first.system.model
+    known, model = [*told], first.system.model
     own_names = {m.a: m.b for m in compared.matching.pairs}
     a = record_of(records[0], model, "rollouts: first")
     b = record_of(records[1], model, "rollouts: second", own_names)
@@ -230,7 +230,8 @@ def compare_records(
         notes.append(
             f"the records have {rates[0]:.6g} and {rates[1]:.6g} rows a second; they are compared at common times"
         )
-    known = known or [*usual_causes(model, first.settings, 1 / rates[1])]
+    # A simulator may do otherwise than its file says.
+    known += usual_causes(model, first.settings, 1 / rates[1])
     end = min(float(a.t[-1]), float(b.t[-1]))
     control: Any = motion.controller if motion.controller != "posture" else "passive"
     if a.u is not None:
@@ -274,12 +275,11 @@ def compare_records(
             bar(0.5 + 0.5 * k / len(pairs), f"{g.kind} and {h.kind}")
             if {(c.where, *c.ours) for c in g.changes}.isdisjoint((c.where, *c.ours) for c in h.changes):
                 tried.append(((g, h), left(h.apply(g.apply(first)))))
-        if len(known) > 2:
+        if len(told) > 2:
             every = first
-            for h in known if compared.regular else ():
+            for h in told:
                 every = h.apply(every)
-            if compared.regular:
-                tried.append((tuple(known), left(every)))
+            tried.append((tuple(told), left(every)))
     # Fewer causes are the better answer unless more of them leave far less.
     best = tried[0]
     for x in sorted(tried[1:], key=lambda x: (len(x[0]), _worst(x))):
