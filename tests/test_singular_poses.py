@@ -274,16 +274,23 @@ def test_near_a_rest_in_the_pose_machine_code_and_python_do_not_take_turns() -> 
     assert run.stats.steps < 1000
 
 
+def hanging(*tilts: float, damping: float = 0.0) -> mb.Model:
+    """Return independent parallelograms side by side, whose links hang in one line where their tilt is zero."""
+    b = mb.ModelBuilder("hanging")
+    for k, tilt in enumerate(tilts):
+        for name, parent, at, length in (("a", "world", 0.0, 1.0), ("b", f"a{k}", 1.0, 2.0), ("c", "world", 2.0, 1.0)):
+            b.add_body(f"{name}{k}", mass=length, com=(0, 0, -length / 2), inertia=(length**3 / 12, length**3 / 12, 0))
+            place = {"parent": parent, "translation": (0, k if parent == "world" else 0, -at)}
+            place |= {"rpy": (0, -tilt if name == "b" else tilt, 0), "damping": damping if name == "a" else 0.0}
+            b.add_joint(f"{name}{k}", "continuous", child=f"{name}{k}", axis=(0, 1, 0), **place)
+        ends = {"translation_a": (0, 0, -2), "translation_b": (0, 0, -1)}
+        b.add_loop(f"pin{k}", "point", body_a=f"b{k}", body_b=f"c{k}", **ends)
+    return b.build()
+
+
 def test_a_motion_that_comes_to_rest_in_the_pose_is_stopped_there() -> None:
     """All links of this parallelogram hang in one line: where damping ends its swing, every branch is as good."""
-    b = mb.ModelBuilder("hanging")
-    for name, parent, at, length in (("a", "world", 0.0, 1.0), ("b", "a", 1.0, 2.0), ("c", "world", 2.0, 1.0)):
-        b.add_body(name, mass=length, com=(0, 0, -length / 2), inertia=(length**3 / 12, length**3 / 12, 0.0))
-        place = {"parent": parent, "translation": (0, 0, -at)}
-        b.add_joint(name, "continuous", child=name, axis=(0, 1, 0), damping=6.0 if name == "a" else 0.0, **place)
-    ends = {"translation_a": (0, 0, -2), "translation_b": (0, 0, -1)}
-    b.add_loop("pin", "point", body_a="b", body_b="c", **ends)
-    dyn = mb.dynamics(b.build(), "lagrangian")
+    dyn = mb.dynamics(hanging(0.0, damping=6.0), "lagrangian")
     with pytest.raises(NumericalError, match="at rest"):
         mb.simulate(dyn, np.zeros(3), np.zeros(3), 0.1, "rk4")
     q, v = np.array([0.3, -0.3, 0.3]), np.zeros(3)
@@ -292,6 +299,26 @@ def test_a_motion_that_comes_to_rest_in_the_pose_is_stopped_there() -> None:
     # A parallelogram all the way.
     assert np.abs(run.q[:, 0] - run.q[:, 2]).max() < 1e-7
     assert told or run.q[-1, 0] > 0
+
+
+@pytest.mark.parametrize("tilts", [(0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.3), (0.3, 0.0)])
+def test_parallelograms_side_by_side_move_as_each_alone(tilts: tuple[float, ...]) -> None:
+    """The neutral pose is singular for each of them: none of them may hide the rank of another."""
+    for engine in ("pinocchio", "lagrangian"):
+        dyn = mb.dynamics(hanging(*tilts), engine)
+        free = dyn.mobility()
+        assert (free.degrees_of_freedom, free.redundant) == (len(tilts), ())
+    alone = mb.dynamics(hanging(0.0), "lagrangian")
+    side, grid = np.array([1.0, -1.0, 1.0]), np.linspace(0, 2, 5)
+    starts, still = 0.7 - 0.2 * np.arange(len(tilts)), np.zeros(3 * len(tilts))
+    setting = {"save": grid, "rtol": 1e-11}
+    run, told = simulated(dyn, np.outer(starts - tilts, side).ravel(), still, 2.0, "rk853", **setting)
+    assert told
+    for k, (start, tilt) in enumerate(zip(starts, tilts, strict=True)):
+        one, _ = simulated(alone, start * side, np.zeros(3), 2.0, "rk853", **setting)
+        assert run.q[:, 3 * k : 3 * k + 3] + tilt * side == pytest.approx(one.q, abs=1e-9)
+    assert np.ptp(run.energy()) < 1e-9
+    assert np.abs(dyn.constraint_residual(run.q)).max() < 1e-13
 
 
 def test_redundant_rows_are_no_singular_pose() -> None:

@@ -335,14 +335,29 @@ class _Numbers:
 
         Beside it one coordinate is held, for the search would end at q again where this is a singular pose.
         """
-        J = self(q)[1][kept]
+        J, free = self._slopes(q, kept, held)
         yield _Pose(*independent_rows(J, len(held)), q)
-        free = np.linalg.svd(J)[2][len(independent_rows(J, len(held))[0]) :]
         moving = np.argsort(-np.linalg.norm(free, axis=0).round(6), kind="stable")[:BESIDE] if len(free) else ()
         for i in moving:
-            x = self.closed(integrate(self.model, q, ASIDE * np.eye(len(J.T))[i]), held, [i])
-            if x is not None and np.isfinite(self(x)[1]).all():
-                yield _Pose(*independent_rows(self(x)[1][kept], len(held)), x)
+            yield from self._beside(q, ASIDE * np.eye(len(J.T))[i], kept, held, [i])
+
+    def moved(self, q: Array, kept: list[int], held: list[int], rng: np.random.Generator) -> Iterator[_Pose]:
+        """Yield what the rows are at poses beside a closed one to which random motions of all coordinates lead."""
+        J, free = self._slopes(q, kept, held)
+        for x in rng.uniform(-ASIDE, ASIDE, (BESIDE, len(J.T))):
+            yield from self._beside(q, free.T @ (free @ x), kept, held)
+
+    def _slopes(self, q: Array, kept: list[int], held: list[int]) -> tuple[Array, Array]:
+        """Return J of the kept rows at q, and a basis of the velocities that they leave free, one a row."""
+        J = self(q)[1][kept]
+        return J, np.linalg.svd(J)[2][len(independent_rows(J, len(held))[0]) :]
+
+    def _beside(
+        self, q: Array, step: Array, kept: list[int], held: list[int], still: Collection[int] = ()
+    ) -> Iterator[_Pose]:
+        x = self.closed(integrate(self.model, q, step), held, still)
+        if x is not None and np.isfinite(self(x)[1]).all():
+            yield _Pose(*independent_rows(self(x)[1][kept], len(held)), x)
 
 
 class _Pose(NamedTuple):
@@ -383,6 +398,9 @@ def _chosen_rows(model: Model) -> RowChoice:
         if q is not None and np.isfinite(numbers(q)[1]).all():
             # On a branch rows may depend on each other at every pose: the rank is that of the poses around.
             best = max(numbers.around(q, kept, held), key=lambda x: (len(x.rows), x.least))
+            if len(best.rows) < len(kept):
+                # One coordinate moves its own loop off a singular pose, and leaves other loops at theirs.
+                best = max([best, *numbers.moved(best.q, kept, held, rng)], key=lambda x: len(x.rows))
             return RowChoice(tuple(kept), len(held), best.rows, names, best.q)
     # The state that a user gives tells more: it is refused there, with the residual of each row.
     return RowChoice(tuple(kept), len(held), tuple(range(len(kept))), names)
