@@ -9,6 +9,7 @@ import _thread
 import signal
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import casadi as ca
@@ -20,6 +21,7 @@ import mbkit as mb
 from mbkit.errors import InputError, TorqueError, UnsupportedError
 from mbkit.simulate import METHODS, Event, Policy, StateFeedback, simulate
 from mbkit.simulate.integrate import _intervals
+from mbkit.simulate.solvers import compiled_fixed_step, machine_code_blocks
 
 PERIOD, STEP, COUNT = 0.04, 0.01, 4
 
@@ -427,3 +429,22 @@ def test_a_sampled_run_passes_a_singular_pose_as_a_run_without_samples_does():
         run = simulate(dyn, *start, dt=STEP, torque=lambda _t, _q, v: 0 * v, hold=STEP, doubt=False)
     assert run.stats.doubts == plain.stats.doubts
     np.testing.assert_array_equal(run.q, plain.q)
+
+
+@pytest.mark.parametrize(("members", "period", "threads"), [(200, 1, 1), (200, 64, 4), (2200, 1, 2)])
+def test_threads_share_a_batch_where_enough_is_between_two_samples(members, period, threads, monkeypatch):
+    """They meet at each sample, which takes as long as some hundred steps."""
+    seen: list[int] = []
+
+    class Pool(ThreadPoolExecutor):
+        def __init__(self, count: int) -> None:
+            seen.append(count)
+            super().__init__(count)
+
+    monkeypatch.setattr(machine_code_blocks, "ThreadPoolExecutor", Pool)
+    monkeypatch.setattr(compiled_fixed_step, "cores", lambda: 4)
+    dyn = mb.dynamics(mb.catalog.pendulum(), "lagrangian", compile=True)
+    push = Policy(lambda _t, q, _v, _i: -q)
+    q = np.linspace(-1.0, 1.0, members)[:, None]
+    simulate(dyn, q, 0 * q, 64 * STEP, dt=STEP, torque=push, hold=period * STEP, save=64)
+    assert seen == ([threads] if threads > 1 else [])

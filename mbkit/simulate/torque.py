@@ -501,10 +501,11 @@ class Torque:
             return
         new = samples.asked[members] <= s
         if new.any():
-            who = members[new]
-            answers = samples.controller.many(t, q[new], v[new], who)
-            self.table[who, samples.rows(s), : self._nv] = answers[:, None]
-            samples.asked[who] = s + 1
+            if not new.all():
+                q, v, members = q[new], v[new], members[new]
+            answers = samples.controller.many(t, q, v, members)
+            self.table[members, samples.rows(s), : self._nv] = answers[:, None]
+            samples.asked[members] = s + 1
 
     def next_sample(self, k: int, steps: int) -> int:
         """Return the first step behind k at which a sampled torque is asked, or how many `steps` there are."""

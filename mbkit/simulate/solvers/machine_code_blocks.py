@@ -244,6 +244,10 @@ def run_members(
     """
     grid, torque, bar = problem.grid, problem.torque, problem.bar
     sampled, n = torque.samples is not None, len(members)
+    if sampled:
+        # Threads meet at each sample.
+        steps = n * grid.steps // max(len(torque.changes(grid.steps)), 1)
+        workers = max(1, min(workers, steps // MIN_STEPS_OF_A_THREAD))
     parts = _split(n, max(-(-n // workers), 1) if sampled else widest, workers)
     width = max((part.stop - part.start for part in parts), default=0)
     ways: dict[int, tuple[_Loop, Iterator[tuple[int, dict[int, list[Array]] | None]]]] = {}
@@ -273,10 +277,16 @@ def run_members(
 
     def ask(waiting: list[int]) -> None:
         loops = [(ways[i][0], members[parts[i]]) for i in waiting]
-        who: Indices = np.concatenate([own[loop.alive] for loop, own in loops])
+        good = [loop.alive for loop, _ in loops]
+        # Most often all go on, and are read where they are.
+        which = [slice(None) if x.all() else x for x in good]
+        who: Indices = np.concatenate([own[x] for (_, own), x in zip(loops, which, strict=True)])
         if len(who):
             k = done[waiting[0]]
-            q, w = (np.concatenate([loop.now(name).T[loop.alive] for loop, _ in loops]) for name in loops[0][0].carried)
+            q, w = (
+                np.concatenate([loop.now(name).T[x] for (loop, _), x in zip(loops, which, strict=True)])
+                for name in loops[0][0].carried
+            )
             try:
                 torque.sample(k, grid.time(k), q, velocity(grid.time(k), q, w, who), who)
             except FunctionError as error:
@@ -324,6 +334,8 @@ _MAX_MULTIPLICATIONS: Final = 10_000
 #: Most states that go side by side: enough for the processor's vectors, and nine
 #: cache lines in a row of them, because an even number would meet in the same sets.
 WIDEST: Final = 72
+#: Fewest steps of all members between two samples for which a thread pays.
+MIN_STEPS_OF_A_THREAD: Final = 1024
 #: Number of blocks without a miss after which one iteration less is tried.
 _BLOCKS_WITHOUT_MISS: Final = 32
 #: Most steps of a block: one that is not solved is repeated.
