@@ -80,6 +80,8 @@ def diff(
     moved = motion or rollouts is not None or path is not None
     if not moved and (controller or dt):
         raise click.UsageError("--controller and --dt go with --motion or --rollouts")
+    if moved and options.get("actuators"):
+        raise click.UsageError("--actuators: with --motion the servos of an MJCF act as its simulator has them")
     from mbkit.engines import dynamics
     from mbkit.studies.explain import explain
 
@@ -96,7 +98,7 @@ def diff(
     result = explain(*sides, names=names, **settings)
     if path is not None:
         _write(result, path, take)
-    if not engines and not moved and (beside := _beside_terms(first, str(second))):
+    if not engines and (beside := _beside_terms(first, str(second))):
         unlike = not beside[0].startswith("not compared")
         head = "beside the terms: " if unlike else ""
         result = replace(result, beside=(f"{head}{beside[0]}", *beside[1:]), agree=result.agree and not unlike)

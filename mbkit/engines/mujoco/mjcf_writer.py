@@ -25,6 +25,8 @@ from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import Path
 
 _TYPES: Final = tuple(KINDS)
+#: Largest number that MuJoCo takes.
+_UNBOUNDED: Final = float(mujoco.mjMAXVAL)
 
 
 def _numbers_not_held(model: Model) -> Iterator[str]:
@@ -95,7 +97,7 @@ def _options(model: Model, settings: Settings) -> Iterator[str]:
         own["integrator"] = {"euler": "Euler", "rk4": "RK4"}.get(name, name)
     if settings.solver:
         own["solver"] = {"newton": "Newton"}.get(settings.solver, settings.solver.upper())
-    if settings.iterations:
+    if settings.iterations is not None:
         own["iterations"] = str(settings.iterations)
     flags = {"eulerdamp": settings.implicit_damping, "limit": settings.limits}
     off = {name: "disable" for name, on in flags.items() if on is False}
@@ -117,7 +119,10 @@ def _actuators(servos: Sequence[Servo], placed: Placed) -> Iterator[str]:
             ("ctrlrange", "ctrllimited", x.control_range),
             ("forcerange", "forcelimited", x.force_range),
         ):
-            own |= {limited: "true", name: bounds} if np.isfinite(bounds).all() else {}
+            # A bound on one side alone is MuJoCo's largest number on the other.
+            own |= (
+                {limited: "true", name: np.clip(bounds, -_UNBOUNDED, _UNBOUNDED)} if np.isfinite(bounds).any() else {}
+            )
         yield f"    <general{_attributes(**own)}/>"
     if servos:
         yield "  </actuator>"

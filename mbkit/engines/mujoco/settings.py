@@ -12,6 +12,9 @@ from typing import Final
 
 import numpy as np
 
+from mbkit._check import count, real
+from mbkit.errors import InputError, require_known
+
 _NO_BOUND: Final = (-np.inf, np.inf)
 
 
@@ -40,6 +43,13 @@ class Servo:
     control_range: tuple[float, float] = _NO_BOUND
     force_range: tuple[float, float] = _NO_BOUND
 
+    def __post_init__(self) -> None:
+        require_known("kind of servo", ("position", "velocity", "motor"), self.kind)
+        for name in ("control_range", "force_range"):
+            low, high = getattr(self, name)
+            if not low < high:
+                raise InputError(f"{name}: expected a lower and a higher bound, got ({low}, {high})")
+
     def torque(self, u: float, q: float, v: float) -> float:
         """Return the generalized force at a control, a position and a velocity."""
         u = min(max(u, self.control_range[0]), self.control_range[1])
@@ -67,7 +77,7 @@ class Settings:
     solver, iterations, tolerance : str, int, float
         Of MuJoCo's constraints: friction, limits, loops.
     limits : bool
-        Whether joint limits act, softly.
+        Whether the limits that joints have act, softly.
     servos : tuple of Servo
         Of the joints that have one; the others get the control as a torque.
     control_period : float
@@ -84,6 +94,13 @@ class Settings:
     limits: bool | None = None
     servos: tuple[Servo, ...] | None = None
     control_period: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("time_step", "control_period"):
+            if getattr(self, name) is not None:
+                real(name, getattr(self, name), positive=True)
+        if self.iterations is not None:
+            count("iterations", self.iterations)
 
     def filled(self, other: Settings) -> Settings:
         """Return these settings, those that nobody has said from another."""

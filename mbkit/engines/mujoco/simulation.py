@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -19,6 +20,8 @@ from mbkit.model import Model
 _SOLVERS: Final = {int(getattr(mujoco.mjtSolver, f"mjSOL_{x}")): x.lower() for x in ("PGS", "CG", "NEWTON")}
 #: Largest size of a coordinate of a run that goes on.
 _MAX_STATE: Final = 1e10
+#: Length of the runs by which a file and its description are compared, s.
+_CHECKED_S: Final = 0.3
 #: Control u(t, q, v), (nv,): what the servo of each velocity takes, or its torque.
 Law = Callable[[float, Array, Array], ArrayLike]
 
@@ -31,10 +34,16 @@ def settings_of(text: str, files: dict[str, bytes], joints: set[str]) -> tuple[S
     m = mujoco.MjModel.from_xml_string(text, files)
     off = {x for x in ("LIMIT", "EULERDAMP", "ACTUATION", "CONTACT") if m.opt.disableflags & _bit(x)}
     servos, left = list[Servo](), list[str]()
+    if "ACTUATION" in off and m.nu:
+        left.append("actuation, which the file has off: controls act as torques")
     for i in range(0 if "ACTUATION" in off else m.nu):
-        servo = _servo(m, i)
-        if servo is None or servo.joint not in joints:
-            left.append(f"actuator {m.actuator(i).name or i}, which is no motor or servo of one joint")
+        servo, called = _servo(m, i), f"actuator {m.actuator(i).name or i}"
+        if m.opt.disableactuator & (1 << int(m.actuator_group[i])):
+            left.append(f"{called}, whose group is off")
+        elif servo is None or servo.joint not in joints:
+            left.append(f"{called}, which is no motor or servo of one joint")
+        elif servo.joint in (x.joint for x in servos):
+            left.append(f"{called}, the second one of joint {servo.joint}")
         else:
             servos.append(servo)
     names = {int(x): f"mujoco_{n}" for n, x in INTEGRATORS.items()}
@@ -54,7 +63,7 @@ def settings_of(text: str, files: dict[str, bytes], joints: set[str]) -> tuple[S
         solver=_SOLVERS[int(m.opt.solver)],
         iterations=int(m.opt.iterations),
         tolerance=float(m.opt.tolerance),
-        limits=bool(m.jnt_limited.any()) and "LIMIT" not in off,
+        limits="LIMIT" not in off,
         servos=tuple(servos),
     )
     return held, left
@@ -87,7 +96,8 @@ def _servo(m: Any, i: int) -> Servo | None:
     """Return an actuator as a motor or a servo of one joint, or None."""
     bias, gain = m.actuator_biasprm[i], float(m.actuator_gainprm[i, 0])
     affine = int(m.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
-    kp, kv = (-float(bias[1]), -float(bias[2])) if affine else (0.0, 0.0)
+    # No zero has a sign.
+    kp, kv = (0.0 - float(bias[1]), 0.0 - float(bias[2])) if affine else (0.0, 0.0)
     of_joint = int(m.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_JOINT)
     joint = m.joint(int(m.actuator_trnid[i, 0])) if of_joint else None
     simple = (
@@ -137,7 +147,8 @@ class OwnSimulation:
         m, d, maps, h = self._m, mujoco.MjData(self._m), self._maps, self._m.opt.timestep
         d.qpos[:] = self._layout.expand_q(q0)[maps.q_index]
         d.qvel[:] = _turned(maps, d.qpos, self._layout.expand_v(v0)[maps.v_index])
-        steps, period = round(duration / h), self.settings.control_period or h
+        # To the end and beyond, and enough to interpolate.
+        steps, period = max(math.ceil(duration / h - 1e-9), 4), self.settings.control_period or h
         states = np.full((steps + 1, m.nq + m.nv), np.nan)
         asked = 0
         with heard_warnings():
@@ -172,3 +183,58 @@ class OwnSimulation:
         d.ctrl[:] = full[self._servos]
         full[self._servos] = 0.0
         d.qfrc_applied[:] = full[self._maps.v_index]
+
+
+def off_the_file(text: str, files: dict[str, bytes], model: Model, settings: Settings) -> float | None:
+    """Return how far a run of a description is from one of its file by `mj_step`, rad or m, contacts off.
+
+    Under constant controls, from a start within the joints' limits and from one beyond some of them. What a file has
+    and neither description nor settings hold shows here, whatever it is. None where the file's joints have no names.
+    """
+    m = mujoco.MjModel.from_xml_string(text, files)
+    m.opt.disableflags |= _bit("CONTACT")
+    own, layout, rng = OwnSimulation(model, settings), model.layout, np.random.default_rng(0)
+    known = {m.joint(j).name: j for j in range(m.njnt)}
+    if not all(j.name in known for j in layout.joints if j.type.nv):
+        return None
+    worst = 0.0
+    for size in (0.1, 1.0):
+        q, v = model.neutral(), 0.3 * rng.standard_normal(model.nv)
+        for j in (x for x in model.independent_joints if x.type.nq == x.type.nv):
+            low, high = np.maximum(j.lower, -1.0), np.minimum(j.upper, 1.0)
+            q[layout.q[j.name]] = (low + high) / 2 + size * np.abs(high - low) * rng.uniform(-0.6, 0.6)
+        controls = {x.joint: 4.0 * size * rng.standard_normal() for x in settings.servos or ()}
+        u = np.zeros(model.nv)
+        for name, x in controls.items():
+            u[layout.v[name]] = x
+        _, ours, _ = own.run(q, v, lambda *_, u=u: u, _CHECKED_S)
+        d = mujoco.MjData(m)
+        full_q, full_v = layout.expand_q(q), layout.expand_v(v)
+        places = list[tuple[slice, slice]]()
+        for j in (x for x in layout.joints if x.type.nv):
+            there = m.joint(known[j.name])
+            at, to = int(there.qposadr[0]), int(there.dofadr[0])
+            here = np.array(full_q[layout.full_q[j.name]])
+            if j.type.quaternion is not None:
+                here[j.type.quaternion :] = np.roll(here[j.type.quaternion :], 1)
+            places.append((slice(at, at + len(here)), layout.full_q[j.name]))
+            d.qpos[at : at + len(here)] = here
+            # A free joint begins unturned: its velocity is the world's and the body's.
+            d.qvel[to : to + j.type.nv] = full_v[layout.full_v[j.name]]
+        for i in range(m.nu):
+            target = m.joint(int(m.actuator_trnid[i, 0])).name
+            d.ctrl[i] = controls.get(target, 0.0) if int(m.actuator_trntype[i]) == 0 else 0.0
+        with heard_warnings():
+            for k in range(len(ours)):
+                for at_file, at_own in places:
+                    x, y = d.qpos[at_file], ours[k, at_own]
+                    # The place and the vector part of a quaternion tell enough.
+                    n = len(y) if len(y) < 4 else len(y) - 4
+                    worst = max(worst, float(np.abs(x[:n] - y[:n]).max(initial=0.0)))
+                    if len(y) >= 4:
+                        w, z = x[n + 1 : n + 4] * np.sign(x[n]), y[n : n + 3] * np.sign(y[n + 3])
+                        worst = max(worst, float(np.abs(w - z).max()))
+                if not worst < 1.0:
+                    break
+                mujoco.mj_step(m, d)
+    return worst

@@ -34,6 +34,7 @@ from mbkit.studies.explain.joint_matching import Matching
 from mbkit.studies.explain.merged_model import MergedModel
 from mbkit.studies.explain.motion_result import CauseMotion, MotionComparison
 from mbkit.studies.explain.worlds import World, joint_order, setting_differences
+from mbkit.studies.formatting import error_text
 from mbkit.studies.results import counted
 
 #: Kinds that stand on a single link, which is fused with others before motions are compared.
@@ -66,6 +67,8 @@ _SPEED: Final = 0.5
 _RTOL: Final = 1e-10
 #: Step of engines' own integrators where nobody has said it, s.
 _ENGINE_STEP: Final = 2e-3
+#: Largest difference of a file's run from that of its description, rad or m, over some tenths of a second.
+_LIKE_THE_FILE: Final = 1e-7
 #: Period of the times at which runs are compared, s.
 _PERIOD: Final = 1e-2
 
@@ -80,7 +83,8 @@ class Motion:
         ``"posture"`` holds a posture near the start: by the servos where a file has them, else by torques, a PD
         controller whose gains the result tells. A function of (t, q, v) returns (nv,): for each velocity what its servo
         takes (a target of a position servo), or its torque. It gets q and v in each side's own order, as a policy does
-        that knows no names. A table is held row by row, each for a control period.
+        that knows no names. One with a memory has a method ``reset()``, called before each run. A table is held row by
+        row, each for a control period.
     times : tuple of float
         When the effects are read, s; the last one ends the runs.
     bound : float
@@ -217,6 +221,14 @@ class Runner:
         says += [f"a PD controller (joint, kp, kd: {'; '.join(gains)})"] if gains else []
         return law, f"{' and '.join(says) or 'nothing'} to the posture ({', '.join(f'{x:.3g}' for x in target)})"
 
+    def require_no_memory(self, world: World) -> None:
+        """Raise where a second run of a world is another one, as the controller keeps something from run to run."""
+        if callable(self.motion.controller):
+            apart, _ = self.between(self.of(world), self._run(world))
+            if np.nan_to_num(apart).any():
+                says = "two runs from one start differ, so it keeps a state from run to run"
+                raise InputError(f"controller: {says}; give it a method reset(), which is called before each run")
+
     def of(self, world: World) -> Run:
         """Return the run of a world."""
         # The key has its model alive, as the run holds it.
@@ -230,6 +242,8 @@ class Runner:
         model, settings, layout = world.system.model, world.settings, world.system.model.layout
         free = [j.name for j in model.independent_joints]
         # A joint that the first does not have begins at zero.
+        if callable(reset := getattr(self.motion.controller, "reset", None)):
+            reset()
         q0, v0 = model.neutral(), np.zeros(model.nv)
         for name in (n for n in free if n in self.q):
             q0[layout.q[name]], v0[layout.v[name]] = self.q[name], self.v[name]
@@ -296,7 +310,8 @@ class Runner:
     def between(self, one: Run, other: Run) -> tuple[Array, list[str]]:
         """Return how far two runs are apart at each time of the grid, (K, joints), and the joints that both have."""
         n, names = min(len(one), len(other)), [x for x in one.positions if x in other.positions]
-        out = np.full((len(self.grid), len(names)), np.nan)
+        # Where one run has ended and the other goes on they are as far apart as can be.
+        out = np.full((len(self.grid), len(names)), np.nan if len(one) == len(other) else np.inf)
         for k, name in enumerate(names):
             # The place and the turn of a free joint, and not the screw between two poses.
             between = JointType.difference(
@@ -396,6 +411,7 @@ def compare_motions(compared: Compared, motion: Motion, names: tuple[str, str]) 
         if only:
             wholes[k] = replace(wholes[k], system=compared.read[k].put(("",), {"time": compared.time}))
     runner = Runner(first, motion, names[1])
+    runner.require_no_memory(first)
     found = list[CauseMotion]()
     with Bar("motions") as bar:
         whole, joints = runner.apart(*wholes)
@@ -541,7 +557,7 @@ def file_settings(path: str | Path, model: Model) -> tuple[Settings | None, tupl
     """
     if not str(path).lower().endswith((".xml", ".mjcf")):
         return None, ()
-    from mbkit.engines.mujoco.simulation import settings_of
+    from mbkit.engines.mujoco.simulation import off_the_file, settings_of
     from mbkit.load.sanitized_text import strip
 
     file = strip(Path(path))
@@ -550,4 +566,12 @@ def file_settings(path: str | Path, model: Model) -> tuple[Settings | None, tupl
     except Exception as error:  # MuJoCo raises errors of many kinds
         raise LoadError(f"{path}: MuJoCo does not read it: {' '.join(str(error).split())}") from None
     pairs = [x for part in file.root.all("contact") for x in part.children]
+    try:
+        off = off_the_file(file.text, file.meshes, model, replace(held, control_period=held.time_step))
+    except UnsupportedError:
+        off = None
+    if off is None:
+        left.append("whether its run is that of mj_step")
+    elif not off <= _LIKE_THE_FILE:
+        left.append(f"what its description lacks: mj_step on the file moves it {error_text(off)} rad or m otherwise")
     return held, (*left, *([counted(len(pairs), "pair or exclusion of contact")] if pairs else []))

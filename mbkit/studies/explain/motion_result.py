@@ -112,6 +112,11 @@ class MotionComparison(ResultTable):
         beside = f"; not compared: {', '.join(self.not_compared)}" if self.not_compared else ""
         return f"the motions are apart by {apart} (rad or m); unexplained: {error_text(max(self.unexplained))}{beside}"
 
+    def alike(self, tolerance: float) -> bool:
+        """Return whether both sides move as one, in runs that all went to their end."""
+        sizes = [*self.whole, *(x for cause in self.effects for x in (cause.largest, *cause.at_times))]
+        return bool(np.all(np.array(sizes) <= tolerance))
+
     def sections(self) -> list[Section]:
         """Return the sections of a document."""
         numbered = [(k, x) for k, x in enumerate(self.effects, 1) if x.largest != 0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -98,6 +99,9 @@ def record_of(data: Any, model: Model, which: str = "record", names: Mapping[str
     found = {kind: _by_joint(model, columns, suffixes, names or {}) for kind, suffixes in _SUFFIXES.items()}
     if lost := [name for name, x in zip(model.coordinate_names, found["q"], strict=True) if x is None]:
         raise InputError(f"{which}: no column of {', '.join(lost)}; there are: {', '.join(columns)[:200]}")
+    if any(x is not None for x in found["u"]):
+        # A joint without a column has no control.
+        found["u"] = [np.zeros(len(t)) if x is None else x for x in found["u"]]
     q, v, u = (None if any(x is None for x in found[kind]) else np.array(found[kind]).T for kind in _SUFFIXES)
     assert q is not None
     return _checked(Record(t, q, v, u, named=True), model, which)
@@ -108,10 +112,10 @@ def _read(path: Path, which: str) -> Mapping[str, Any]:
         if path.suffix == ".npz":
             with np.load(path) as held:
                 return {name: held[name] for name in held.files}
-        with path.open(newline="", encoding="utf-8") as file:
-            head, *rows = csv.reader(file)
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            head, *rows = (row for row in csv.reader(file) if row)
         return dict(zip((x.strip() for x in head), np.array(rows, dtype=np.float64).T, strict=True))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError, KeyError, csv.Error, zipfile.BadZipFile) as error:
         raise InputError(f"{which}: {path} is no CSV of numbers under a line of names, and no NPZ: {error}") from None
 
 
@@ -150,13 +154,21 @@ def _from_mujoco(model: Model, columns: Mapping[str, Array], which: str) -> tupl
 
 
 def _checked(x: Record, model: Model, which: str) -> Record:
-    t = finite_array(f"{which}: t", x.t, (len(x.t),))
+    t = finite_array(f"{which}: t", x.t, (np.size(x.t),))
+    if u_at_uneven_times(x):
+        raise InputError(f"{which}: controls are held over equal periods; expected rows at equal times")
     if len(t) < 3 or not (np.diff(t) > 0).all():
         raise InputError(f"{which}: expected at least three increasing times, got {len(t)} of them")
     size = {"q": model.nq, "v": model.nv, "u": model.nv}
     held = ((n, k, getattr(x, n)) for n, k in size.items())
     more: dict[str, Any] = {n: finite_array(f"{which}: {n}", y, (len(t), k)) for n, k, y in held if y is not None}
     return replace(x, t=t - t[0], **more)
+
+
+def u_at_uneven_times(x: Record) -> bool:
+    """Return whether controls stand at times that are not equal steps."""
+    steps = np.diff(x.t)
+    return x.u is not None and bool(len(steps)) and bool(np.ptp(steps) > 1e-6 * steps.max())
 
 
 def expect_same_units(a: Record, b: Record) -> None:
@@ -234,14 +246,23 @@ def compare_records(
     known += usual_causes(model, first.settings, 1 / rates[1])
     end = min(float(a.t[-1]), float(b.t[-1]))
     control: Any = motion.controller if motion.controller != "posture" else "passive"
-    if a.u is not None:
-        control = a.u
-        first = first.put(("settings",), {"control_period": float(a.t[1])})
-    grid = a.t[a.t <= end + 1e-12]
-    motion = replace(motion, q=a.q[0], v=0.0 * a.q[0, : model.nv], controller=control, times=(end,))
-    start = a.v[0] if a.v is not None else _fitted_velocity(first, motion, a)
-    runner = Runner(first, replace(motion, v=start), names[1], grid)
-    layout = model.layout
+    grid, layout = a.t[a.t <= end + 1e-12], model.layout
+    if (off := float(np.abs(a.q[0] - b.q[0]).max(initial=0.0))) > motion.bound:
+        notes.append(f"the records begin {off:.3g} rad or m apart, where one start was expected")
+
+    def moved_by(x: Record) -> tuple[World, Motion]:
+        """Return the first's world and motion under the controls of a record, if it has any."""
+        world, law = first, control if x.u is None else x.u
+        if x.u is not None:
+            world = first.put(("settings",), {"control_period": float(x.t[1])})
+        return world, replace(motion, q=a.q[0], v=np.zeros(model.nv), controller=law, times=(end,))
+
+    world_a, motion_a = moved_by(a)
+    start = a.v[0] if a.v is not None else _fitted_velocity(world_a, motion_a, a)
+    own_runner = Runner(world_a, replace(motion_a, v=start), names[1], grid)
+    # Each record has its own controls.
+    first, motion_b = moved_by(b) if b.u is not None else (world_a, motion_a)
+    runner = Runner(first, replace(motion_b, v=start), names[1], grid)
 
     def as_run(x: Record) -> Run:
         from scipy.interpolate import CubicSpline
@@ -261,7 +282,7 @@ def compare_records(
             return np.full(len(grid), np.inf)
 
     apart, joints = runner.between(one, other)
-    own = runner.between(runner.of(first), one)[0].max(axis=1, initial=0.0)
+    own = runner.between(own_runner.of(world_a), one)[0].max(axis=1, initial=0.0)
     tried = list[tuple[tuple[Hypothesis, ...], Array]]([((), left(first))])
     with Bar("records") as bar:
         for k, h in enumerate(known):

@@ -135,7 +135,7 @@ class Explanation(ResultTable):
         count, silent = len(self.acting), len(self.causes) - len(self.acting)
         beside = f"; {_counted(silent, 'difference')} that change{'s' * (silent == 1)} no term" if silent else ""
         alike = self.comparable and not (self.massless or self.acting) and self.worst <= self.tolerance
-        if self.agree or (self.beside and alike):
+        if self.agree or ((self.beside or self.motion is not None) and alike):
             cancel = f"; {_counted(count, 'difference')} that cancel" if count else ""
             if not self.compared:
                 none = "no motion was compared: no state keeps the constraints, or the mass matrix is singular"

@@ -119,7 +119,7 @@ def explain(
             return out
         how = with_engines(motion if isinstance(motion, Motion) else Motion(), a, b)
         found = compare_motions(study.compared, how, names)
-        return replace(out, motion=found, agree=out.agree and not any(x.largest > tolerance for x in found.effects))
+        return replace(out, motion=found, agree=out.agree and found.alike(tolerance))
 
 
 def _model(x: Model | Dynamics, which: str) -> Model:
