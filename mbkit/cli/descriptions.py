@@ -101,7 +101,9 @@ def diff(
     if not engines and (beside := _beside_terms(first, str(second))):
         unlike = not beside[0].startswith("not compared")
         head = "beside the terms: " if unlike else ""
-        result = replace(result, beside=(f"{head}{beside[0]}", *beside[1:]), agree=result.agree and not unlike)
+        if unlike or not moved:
+            # A motion says itself what of the files no run has.
+            result = replace(result, beside=(f"{head}{beside[0]}", *beside[1:]), agree=result.agree and not unlike)
     shared.show(result.document(), as_json=as_json)
     shared.leave(shared.AGREE if result.agree else shared.DIFFER)
 
