@@ -154,7 +154,7 @@ def test_markdown_has_every_difference_and_a_terminal_the_gravest():
     changes = tuple(replace(CHECKED.changes[0], text=f"change {k}") for k in range(30))
     moved = tuple(replace(CHECKED.moved[0], term=f"term {k}", error=1.0 / (k + 1)) for k in range(9))
     many = replace(CHECKED, changes=changes, moved=moved)
-    for shown, (described, numbers) in ((many.to_markdown(), (30, 9)), (to_html(many.document(full=False)), (20, 5))):
+    for shown, (described, numbers) in ((many.to_markdown(), (30, 9)), (to_html(many.document(full=False)), (20, 8))):
         assert (shown.count("description: change"), shown.count("off by")) == (described, numbers)
     links = tuple(LintFinding(f"link{k}", "density", 1.0, "2", "likely", "too light") for k in range(9))
     linted = LintResult("arm", links, 9, 8, 0)
