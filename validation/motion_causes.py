@@ -183,7 +183,10 @@ def base_frame(root: ET.Element, _: np.random.Generator) -> str:
     R = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
     for part in (*base.findall("inertial"), *base.findall("body"), *base.findall("site")):
         numbers(part, "pos", lambda x: R @ x, "0 0 0")
-        numbers(part, "quat", lambda x: quaternion_product(turn, x), "1 0 0 0")
+        if part.get("xyaxes"):
+            numbers(part, "xyaxes", lambda x: (R @ x.reshape(2, 3).T).T.ravel())
+        else:
+            numbers(part, "quat", lambda x: quaternion_product(turn, x), "1 0 0 0")
     return "frame of the free joint"
 
 
@@ -213,6 +216,10 @@ FAULTS: dict[str, Edit] = {
     "base frame": base_frame,
     "mimic": mimic,
 }
+
+
+#: Faults that few robots can have, in some pairs of these.
+OF_FEW = {1: "mimic", 6: "base frame", 11: "mimic", 17: "base frame"}
 
 
 def bare(text: str, q: dict[str, np.ndarray], v: dict[str, np.ndarray], u: np.ndarray) -> dict[str, np.ndarray]:
@@ -271,7 +278,8 @@ def pair(number: int, name: str, floating: bool) -> dict[str, Any]:
     root = ET.fromstring(text)
     changed, planted = copy.deepcopy(root), list[tuple[str, str]]()
     alone = dict[str, str]()
-    for fault in rng.permutation(list(FAULTS)):
+    drawn = [str(x) for x in rng.permutation(list(FAULTS))]
+    for fault in dict.fromkeys([*([OF_FEW[number]] if number in OF_FEW else []), *drawn]):
         if len(planted) > number % 3:
             break
         one = copy.deepcopy(root)
