@@ -15,12 +15,14 @@ from click.testing import CliRunner
 import mbkit as mb
 from mbkit import spatial
 from mbkit.cli import cli
-from mbkit.engines.mujoco.settings import WORDS
 from mbkit.engines.mujoco.simulation import OwnSimulation
 from mbkit.errors import InputError, OutputError, UnsupportedError
-from mbkit.studies.explain import Explanation, Motion, Servo, Settings, file_settings, record_of
+from mbkit.methods.simulation_settings import WORDS
+from mbkit.studies.explain import Explanation, Motion, Servo, Settings, file_settings, record_of, records, worlds
+from mbkit.studies.explain.hypotheses import Hypothesis
 from mbkit.studies.explain.worlds import setting_differences
 from mbkit.studies.written_causes import write_causes
+from tests import kind_examples
 from tests.test_causes import robot, with_body, with_joint
 
 ARM = """<mujoco model="arm">
@@ -217,6 +219,57 @@ def test_what_no_setting_holds_of_a_file_is_never_compared_in_silence(tmp_path: 
     _, left = file_settings(path, mb.load(path))
     assert left
     assert file_settings(write(tmp_path, ARM), mb.load(tmp_path / "b.xml"))[1] == ()
+
+
+def test_an_actuator_of_a_site_names_no_joint(tmp_path: Path) -> None:
+    """Its numbers are those of other objects, of which there may be more than joints."""
+    sites = "".join(f'<site name="s{k}"/>' for k in range(9))
+    text = ARM.replace('<body name="tip"', f'{sites}<body name="tip"')
+    path = tmp_path / "a.xml"
+    path.write_text(text.replace("</actuator>", '<motor name="m" site="s8" gear="0 0 1 0 0 0"/></actuator>'))
+    held, left = file_settings(path, mb.load(path))
+    assert [x.joint for x in held.servos] == ["shoulder", "elbow", "wrist"]
+    assert left == ("actuator m, which is no motor or servo of one joint",)
+
+
+@pytest.mark.parametrize(
+    ("threshold", "below", "above"),
+    [
+        # Residuals of the second of two tries: a pair is named below, and not above.
+        ((records, "PAIR_GAIN"), 0.05, 0.5),
+        # How far a file's run is from its description's.
+        ((worlds, "LIKE_THE_FILE"), 5e-8, 5e-7),
+    ],
+)
+def test_thresholds_decide_between_two_sides(
+    threshold: tuple[Any, str], below: float, above: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module, name = threshold
+    one, other = Hypothesis("a", "", ""), Hypothesis("b", "", "")
+
+    def far(x: float) -> bool:
+        if module is records:
+            tried = [((), np.array([99.0])), ((one,), np.array([1.0])), ((one, other), np.array([x]))]
+            return len(records.nearest(tried)[0]) == 1
+        monkeypatch.setattr(OwnSimulation, "off_the_file", lambda *_: x)
+        path = tmp_path / "a.xml"
+        path.write_text(ARM)
+        return file_settings(path, mb.load(path))[1] != ()
+
+    assert [far(below), far(above)] == [False, True]
+    for factor in (0.1, 10.0):
+        with monkeypatch.context() as there:
+            there.setattr(module, name, factor * getattr(module, name))
+            assert far(below) == far(above)
+
+
+def test_every_part_that_fusing_links_loses_is_refused() -> None:
+    for name in ("body.rotor", "force.compensation"):
+        model = kind_examples.example(name).model
+        with pytest.raises(UnsupportedError, match="lost where links are fused"):
+            mb.explain(model, model, motion=True)
+    with pytest.raises(UnsupportedError, match="fused"):
+        mb.explain(model, model, rollouts=({}, {}))
 
 
 def write(folder: Path, text: str) -> Path:
@@ -440,6 +493,7 @@ def test_a_motion_that_diverges_says_when(tmp_path: Path) -> None:
     assert found is not None
     assert any("leaves all bounds at" in x for x in found.notes)
     assert not found.alike(1e-9)
+    assert "unexplained: NaN" in found.verdict
     assert not moved(tmp_path, ARM, controller=law).agree
 
 
@@ -461,7 +515,7 @@ def test_the_result_is_data_and_a_picture(tmp_path: Path) -> None:
     assert [x.kind for x in again.motion.effects] == [x.kind for x in found.motion.effects]
     with pytest.raises(UnsupportedError):
         again.motion.effects[0].apply(mb.load(tmp_path / "a.xml"))
-    assert len(found.motion.to_csv().splitlines()) == 3
+    assert len(found.motion.to_csv().splitlines()) == 1 + 2 * len(TIMES)
     assert len(found.motion.plot().axes) == 2
     assert "not compared" in moved(tmp_path, ARM).verdict or "unexplained: 0" in moved(tmp_path, ARM).verdict
     assert moved(tmp_path, ARM).agree

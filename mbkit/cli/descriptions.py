@@ -80,6 +80,8 @@ def diff(
     moved = motion or rollouts is not None or path is not None
     if not moved and (controller or dt):
         raise click.UsageError("--controller and --dt go with --motion or --rollouts")
+    if (take and path is None) or (rollouts is not None and path is not None):
+        raise click.UsageError("--take goes with --write, and --write with --motion: records have no numbered causes")
     if moved and options.get("actuators"):
         raise click.UsageError("--actuators: with --motion the servos of an MJCF act as its simulator has them")
     from mbkit.engines import dynamics
@@ -122,7 +124,9 @@ def _motion(
     for k, side in enumerate(sides):
         target, engine = targets[k % len(targets)], getattr(side, "engine", None)
         robot = find(target)
-        own, left = (None, ()) if engine else file_settings(robot.path if robot else target, side)
+        own, left = file_settings(robot.path if robot else target, getattr(side, "model", side))
+        if engine and own is not None:
+            own, left = None, ("options, limits and servos", *left)
         held.append(replace(own or Settings(engine=engine), time_step=dt) if dt is not None else own)
         left_out.append(left)
     law: Any = controller or "posture"

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
-from mbkit.engines.mujoco.settings import Settings
 from mbkit.errors import InputError, MbkitError, OutputError
+from mbkit.methods.simulation_settings import Settings
 from mbkit.studies.convert import convert
 from mbkit.studies.explain.merged_model import MergedModel
 from mbkit.studies.explain.result import Explanation
@@ -45,8 +45,8 @@ def write_causes(result: Explanation, path: Path, which: Sequence[int] = ()) -> 
         raise InputError(f"which: expected numbers from 1 to {len(effects)}, got {bad}")
     if path.exists():
         raise OutputError(f"{path} is there already; choose another")
-    world, notes = first, list[str]()
-    for effect in [effects[k - 1] for k in which] or effects:
+    world, notes, chosen = first, list[str](), [effects[k - 1] for k in which] or effects
+    for effect in chosen:
         if effect.change is None or not effect.change.changes or effect.kind == "joint order":
             notes.append(f"not taken over, as no file holds it alone: {effect}")
         else:
@@ -54,7 +54,7 @@ def write_causes(result: Explanation, path: Path, which: Sequence[int] = ()) -> 
     model, settings = world.system.model, world.settings
     if path.suffix.lower() == ".urdf":
         text = convert(model, "urdf").text
-        lost = [x for x in effects if x.change is not None and {c.where[0] for c in x.change.changes} == {"settings"}]
+        lost = [x for x in chosen if x.change is not None and {c.where[0] for c in x.change.changes} == {"settings"}]
         notes += [f"a URDF has no settings of a simulation: {x}" for x in lost]
     else:
         text = _mjcf(world.system, settings, notes)

@@ -16,10 +16,10 @@ from mbkit._escape import xml_attribute, xml_comment
 from mbkit.engines.mujoco.constraints import OF_JOINTS, OF_TENDON
 from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.mujoco.model import INERTIA, MUJOCO, OF_COUPLING, Placed, by_mbkit, heard_warnings, mapped, specified
-from mbkit.engines.mujoco.settings import Servo, Settings
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.load.mjcf import JOINT_NUMBERS
 from mbkit.load.mjcf_reader import KINDS
+from mbkit.methods.simulation_settings import Servo, Settings
 from mbkit.model import Joint, Model
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import Path

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Final
 
 import mujoco
@@ -14,14 +14,15 @@ from mbkit._check import Array
 from mbkit.engines.mujoco.engine import INTEGRATORS, _turned
 from mbkit.engines.mujoco.mjcf_writer import mjcf_text
 from mbkit.engines.mujoco.model import heard_warnings, mapped, specified
-from mbkit.engines.mujoco.settings import Servo, Settings
+from mbkit.methods.simulation_settings import Servo, Settings
 from mbkit.model import Model
 
 _SOLVERS: Final = {int(getattr(mujoco.mjtSolver, f"mjSOL_{x}")): x.lower() for x in ("PGS", "CG", "NEWTON")}
 #: Largest size of a coordinate of a run that goes on.
 _MAX_STATE: Final = 1e10
-#: Length of the runs by which a file and its description are compared, s.
-_CHECKED_S: Final = 0.3
+#: Length of the runs by which a file and its description are compared, s, and their starts in parts of the ranges.
+_CHECKED_S: Final = 0.1
+_STARTS: Final = (0.1, 1.3)
 #: Control u(t, q, v), (nv,): what the servo of each velocity takes, or its torque.
 Law = Callable[[float, Array, Array], ArrayLike]
 
@@ -98,8 +99,8 @@ def _servo(m: Any, i: int) -> Servo | None:
     affine = int(m.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
     # No zero has a sign.
     kp, kv = (0.0 - float(bias[1]), 0.0 - float(bias[2])) if affine else (0.0, 0.0)
-    of_joint = int(m.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_JOINT)
-    joint = m.joint(int(m.actuator_trnid[i, 0])) if of_joint else None
+    name = dict(_driven(m)).get(i)
+    joint = None if name is None else m.joint(int(m.actuator_trnid[i, 0]))
     simple = (
         int(m.actuator_dyntype[i]) == int(mujoco.mjtDyn.mjDYN_NONE)
         and int(m.actuator_gaintype[i]) == int(mujoco.mjtGain.mjGAIN_FIXED)
@@ -184,57 +185,49 @@ class OwnSimulation:
         full[self._servos] = 0.0
         d.qfrc_applied[:] = full[self._maps.v_index]
 
+    def off_the_file(self, text: str, files: dict[str, bytes]) -> float | None:
+        """Return how far its runs are from those of a file by `mj_step`, rad or m, contacts off.
 
-def off_the_file(text: str, files: dict[str, bytes], model: Model, settings: Settings) -> float | None:
-    """Return how far a run of a description is from one of its file by `mj_step`, rad or m, contacts off.
+        From a start within the joints' limits and from one beyond them, under constant controls: what the file has and
+        neither description nor settings hold shows here, whatever it is. None where the file has joints of other names.
+        """
+        m, other = self._m, mujoco.MjModel.from_xml_string(text, files)
+        other.opt.disableflags |= _bit("CONTACT")
+        joints, there = [m.joint(j) for j in range(m.njnt)], {other.joint(j).name: j for j in range(other.njnt)}
+        if other.nq != m.nq or any(m.jnt_type[x.id] != other.jnt_type[there.get(x.name, -1)] for x in joints):
+            return None
+        if {x.name for x in joints} != there.keys():
+            return None
+        pairs = [(x, other.joint(there[x.name])) for x in joints]
+        q_at, v_at = np.zeros(m.nq, int), np.zeros(m.nv, int)
+        for mine, own in pairs:
+            q_at[mine.qposadr[0] :][: len(mine.qpos0)] = own.qposadr[0] + np.arange(len(mine.qpos0))
+            v_at[mine.dofadr[0] :][: len(mine.damping)] = own.dofadr[0] + np.arange(len(mine.damping))
+        straight = [x for x in joints if len(x.qpos0) == 1]
+        bounds = np.array([x.range if m.jnt_limited[x.id] else (-1.0, 1.0) for x in straight]).reshape(-1, 2)
+        servos, rng, worst = [x.joint for x in self.settings.servos or ()], np.random.default_rng(0), 0.0
+        for size in _STARTS:
+            d, e = mujoco.MjData(m), mujoco.MjData(other)
+            away = size * rng.uniform(-0.5, 0.5, len(straight)) * np.ptp(bounds, axis=1)
+            d.qpos[[x.qposadr[0] for x in straight]] = bounds.mean(axis=1) + away
+            d.qvel[:] = 0.3 * rng.standard_normal(m.nv)
+            # Beyond the usual ranges of control too.
+            d.ctrl[:] = 4.0 * size * rng.standard_normal(m.nu)
+            e.qpos[q_at], e.qvel[v_at] = d.qpos, d.qvel
+            for i, joint in _driven(other):
+                e.ctrl[i] = d.ctrl[servos.index(joint)] if joint in servos else 0.0
+            with heard_warnings():
+                for _ in range(round(_CHECKED_S / m.opt.timestep)):
+                    mujoco.mj_step(m, d)
+                    mujoco.mj_step(other, e)
+                    worst = max(worst, float(np.abs(d.qpos - e.qpos[q_at]).max(initial=0.0)))
+                    if not worst < 1.0:
+                        return worst
+        return worst
 
-    Under constant controls, from a start within the joints' limits and from one beyond some of them. What a file has
-    and neither description nor settings hold shows here, whatever it is. None where the file's joints have no names.
-    """
-    m = mujoco.MjModel.from_xml_string(text, files)
-    m.opt.disableflags |= _bit("CONTACT")
-    own, layout, rng = OwnSimulation(model, settings), model.layout, np.random.default_rng(0)
-    known = {m.joint(j).name: j for j in range(m.njnt)}
-    if not all(j.name in known for j in layout.joints if j.type.nv):
-        return None
-    worst = 0.0
-    for size in (0.1, 1.0):
-        q, v = model.neutral(), 0.3 * rng.standard_normal(model.nv)
-        for j in (x for x in model.independent_joints if x.type.nq == x.type.nv):
-            low, high = np.maximum(j.lower, -1.0), np.minimum(j.upper, 1.0)
-            q[layout.q[j.name]] = (low + high) / 2 + size * np.abs(high - low) * rng.uniform(-0.6, 0.6)
-        controls = {x.joint: 4.0 * size * rng.standard_normal() for x in settings.servos or ()}
-        u = np.zeros(model.nv)
-        for name, x in controls.items():
-            u[layout.v[name]] = x
-        _, ours, _ = own.run(q, v, lambda *_, u=u: u, _CHECKED_S)
-        d = mujoco.MjData(m)
-        full_q, full_v = layout.expand_q(q), layout.expand_v(v)
-        places = list[tuple[slice, slice]]()
-        for j in (x for x in layout.joints if x.type.nv):
-            there = m.joint(known[j.name])
-            at, to = int(there.qposadr[0]), int(there.dofadr[0])
-            here = np.array(full_q[layout.full_q[j.name]])
-            if j.type.quaternion is not None:
-                here[j.type.quaternion :] = np.roll(here[j.type.quaternion :], 1)
-            places.append((slice(at, at + len(here)), layout.full_q[j.name]))
-            d.qpos[at : at + len(here)] = here
-            # A free joint begins unturned: its velocity is the world's and the body's.
-            d.qvel[to : to + j.type.nv] = full_v[layout.full_v[j.name]]
-        for i in range(m.nu):
-            target = m.joint(int(m.actuator_trnid[i, 0])).name
-            d.ctrl[i] = controls.get(target, 0.0) if int(m.actuator_trntype[i]) == 0 else 0.0
-        with heard_warnings():
-            for k in range(len(ours)):
-                for at_file, at_own in places:
-                    x, y = d.qpos[at_file], ours[k, at_own]
-                    # The place and the vector part of a quaternion tell enough.
-                    n = len(y) if len(y) < 4 else len(y) - 4
-                    worst = max(worst, float(np.abs(x[:n] - y[:n]).max(initial=0.0)))
-                    if len(y) >= 4:
-                        w, z = x[n + 1 : n + 4] * np.sign(x[n]), y[n : n + 3] * np.sign(y[n + 3])
-                        worst = max(worst, float(np.abs(w - z).max()))
-                if not worst < 1.0:
-                    break
-                mujoco.mj_step(m, d)
-    return worst
+
+def _driven(m: Any) -> Iterator[tuple[int, str]]:
+    """Yield each actuator of one joint, and the joint's name."""
+    for i in range(m.nu):
+        if int(m.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_JOINT):
+            yield i, m.joint(int(m.actuator_trnid[i, 0])).name

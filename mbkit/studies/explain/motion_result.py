@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -66,12 +68,16 @@ class CauseMotion:
         return changed(self.change, self.says, side, back=True)
 
 
+def _of_cause(value: Callable[[Any], Any], row: tuple[CauseMotion, float, float, float]) -> Any:
+    return value(row[0])
+
+
 @dataclass(frozen=True)
 class MotionComparison(ResultTable):
     """How far two simulations move apart, and which cause does how much of it.
 
     `whole` is the largest difference of a coordinate, rad or m, at `times`; `explained` the change that all causes
-    together make of the first side, `unexplained` what is then left of the difference. `effects` has the causes, the
+    make together, `unexplained` what is then left of the difference. `effects` has the causes, the
     largest change first. `settings` are those of the two sides, `not_compared` what no run has. `joint` is the one that
     is furthest apart, `paths` are its coordinates on both sides at the times of `grid`, and `over_time` the whole
     difference there.
@@ -99,18 +105,24 @@ class MotionComparison(ResultTable):
     _listed = "effects"
     _derived = ("verdict",)
     _csv_columns: ClassVar = {
-        **columns_of(CauseMotion),
-        "alone": lambda x: x.alone[-1],
-        "without": lambda x: x.without[-1],
-        "largest": lambda x: x.largest,
+        **{name: partial(_of_cause, value) for name, value in columns_of(CauseMotion).items()},
+        "time": lambda row: row[1],
+        "alone": lambda row: row[2],
+        "without": lambda row: row[3],
     }
+
+    def _csv_rows(self) -> Iterator[tuple[CauseMotion, float, float, float]]:
+        for x in self.effects:
+            yield from ((x, *row) for row in zip(self.times, x.alone, x.without, strict=True))
 
     @property
     def verdict(self) -> str:
         """One sentence: how far apart, and how much of it is explained."""
         apart = ", ".join(f"{error_text(x)} after {t:g} s" for x, t in zip(self.whole, self.times, strict=True))
+        # NaN where a run had ended is the largest.
+        left = float(np.max(self.unexplained))
         beside = f"; not compared: {', '.join(self.not_compared)}" if self.not_compared else ""
-        return f"the motions are apart by {apart} (rad or m); unexplained: {error_text(max(self.unexplained))}{beside}"
+        return f"the motions are apart by {apart} (rad or m); unexplained: {error_text(left)}{beside}"
 
     def alike(self, tolerance: float) -> bool:
         """Return whether both sides move as one, in runs that all went to their end."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -13,17 +13,17 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit import spatial
-from mbkit._check import Array, finite_array
-from mbkit.engines.mujoco.settings import Settings
+from mbkit._check import Array, by_key, finite_array
 from mbkit.engines.registry import MUJOCO
 from mbkit.errors import InputError, MbkitError
 from mbkit.methods.registry import METHODS
+from mbkit.methods.simulation_settings import Settings
 from mbkit.model import Model
-from mbkit.model.elements.kinds import PART_KINDS
 from mbkit.simulate import Trajectory
 from mbkit.simulate.progress import Bar
-from mbkit.studies.explain.hypotheses import Change, Hypothesis
-from mbkit.studies.explain.motion import Compared, Motion, Run, Runner, runnable
+from mbkit.studies.explain.controlled_runs import Motion, Run, Runner, runnable
+from mbkit.studies.explain.hypotheses import Change, Hypothesis, absences
+from mbkit.studies.explain.motion import Compared
 from mbkit.studies.explain.motion_result import RecordComparison, TriedCause
 from mbkit.studies.explain.worlds import World, joint_order, setting_differences
 
@@ -42,7 +42,7 @@ _MAX_IN_PAIRS: Final = 8
 #: Best causes that are tried with all others.
 _MAX_WITH_ALL: Final = 2
 #: A pair is named where it leaves less than this fraction of what the best single cause leaves.
-_PAIR_GAIN: Final = 0.1
+PAIR_GAIN: Final = 0.1
 #: Usual steps of simulators, s, and numbers of steps between two rows.
 _STEPS: Final = (5e-4, 1e-3, 2e-3, 4e-3, 5e-3, 1e-2)
 _ROWS_IN_PERIOD: Final = (1, 2, 4, 5, 10)
@@ -155,7 +155,7 @@ def _from_mujoco(model: Model, columns: Mapping[str, Array], which: str) -> tupl
 
 def _checked(x: Record, model: Model, which: str) -> Record:
     t = finite_array(f"{which}: t", x.t, (np.size(x.t),))
-    if u_at_uneven_times(x):
+    if _holds_at_uneven_times(x):
         raise InputError(f"{which}: controls are held over equal periods; expected rows at equal times")
     if len(t) < 3 or not (np.diff(t) > 0).all():
         raise InputError(f"{which}: expected at least three increasing times, got {len(t)} of them")
@@ -165,7 +165,7 @@ def _checked(x: Record, model: Model, which: str) -> Record:
     return replace(x, t=t - t[0], **more)
 
 
-def u_at_uneven_times(x: Record) -> bool:
+def _holds_at_uneven_times(x: Record) -> bool:
     """Return whether controls stand at times that are not equal steps."""
     steps = np.diff(x.t)
     return x.u is not None and bool(len(steps)) and bool(np.ptp(steps) > 1e-6 * steps.max())
@@ -203,15 +203,10 @@ def usual_causes(model: Model, settings: Settings, period: float) -> Iterator[Hy
                 f"has gravity of {text} m/s²",
                 (Change(("",), {"gravity": model.gravity}, {"gravity": other}),),
             )
-    for name, kind in PART_KINDS.items():
-        if name in model.acts and name.startswith("joint.") and kind.does & {"T", "loss", "jump"}:
-            number = name.partition(".")[2]
-            some = [j for j in model.joints if np.any(getattr(j, number, 0.0))]
-            changes = [
-                Change(("joints", j.name), {number: getattr(j, number)}, {number: 0 * getattr(j, number)}) for j in some
-            ]
-            if changes:
-                yield Hypothesis(number, "", f"has no {number}", tuple(changes))
+    lost = by_key((x.kind, (j, x)) for j in model.joints for x in absences(j))
+    for kind, some in lost.items():
+        changes = [Change(("joints", j.name), {n: getattr(j, n) for n in x.fields}, x.fields) for j, x in some]
+        yield Hypothesis(kind, "", some[0][1].says, tuple(changes))
 
 
 def compare_records(
@@ -283,29 +278,8 @@ def compare_records(
 
     apart, joints = runner.between(one, other)
     own = runner.between(own_runner.of(world_a), one)[0].max(axis=1, initial=0.0)
-    tried = list[tuple[tuple[Hypothesis, ...], Array]]([((), left(first))])
-    with Bar("records") as bar:
-        for k, h in enumerate(known):
-            bar(0.5 * k / len(known), h.kind)
-            tried.append(((h,), left(h.apply(first))))
-        singles = sorted(tried[1:], key=_worst)[:_MAX_IN_PAIRS]
-        near = [hs[0] for hs, _ in singles]
-        # A step may say nothing until the integrator is the right one.
-        pairs = [*combinations(near, 2), *((g, h) for g in near[:_MAX_WITH_ALL] for h in known if h not in near)]
-        for k, (g, h) in enumerate(pairs):
-            bar(0.5 + 0.5 * k / len(pairs), f"{g.kind} and {h.kind}")
-            if {(c.where, *c.ours) for c in g.changes}.isdisjoint((c.where, *c.ours) for c in h.changes):
-                tried.append(((g, h), left(h.apply(g.apply(first)))))
-        if len(told) > 2:
-            every = first
-            for h in told:
-                every = h.apply(every)
-            tried.append((tuple(told), left(every)))
-    # Fewer causes are the better answer unless more of them leave far less.
-    best = tried[0]
-    for x in sorted(tried[1:], key=lambda x: (len(x[0]), _worst(x))):
-        if _worst(x) < _worst(best) * (_PAIR_GAIN if len(x[0]) > len(best[0]) else 1.0):
-            best = x
+    tried = _tried(first, told, known, left)
+    best = nearest(tried)
     beyond = apart > motion.bound if (apart > motion.bound).any() else apart > 0.1 * apart.max(initial=0.0)
     rows = np.where(beyond.any(axis=0), beyond.argmax(axis=0), len(grid))
     shown = joints[int(rows.argmin())] if joints and beyond.any() else ""
@@ -326,6 +300,43 @@ def compare_records(
         over_time=tuple(apart.max(axis=1, initial=0.0).tolist()),
         residual_over_time=tuple(best[1].tolist()),
     )
+
+
+#: Causes, and how far the first side with them is from the second record over time, (K,).
+_Try = tuple[tuple[Hypothesis, ...], Array]
+
+
+def _tried(
+    first: World, told: Sequence[Hypothesis], known: Sequence[Hypothesis], left: Callable[[World], Array]
+) -> list[_Try]:
+    """Return what is left with no cause, with each one, with pairs, and with all that the files tell."""
+    tried: list[_Try] = [((), left(first))]
+    with Bar("records") as bar:
+        for k, h in enumerate(known):
+            bar(0.5 * k / len(known), h.kind)
+            tried.append(((h,), left(h.apply(first))))
+        near = [hs[0] for hs, _ in sorted(tried[1:], key=_worst)[:_MAX_IN_PAIRS]]
+        # A step may say nothing until the integrator is the right one.
+        pairs = [*combinations(near, 2), *((g, h) for g in near[:_MAX_WITH_ALL] for h in known if h not in near)]
+        for k, (g, h) in enumerate(pairs):
+            bar(0.5 + 0.5 * k / len(pairs), f"{g.kind} and {h.kind}")
+            if {(c.where, *c.ours) for c in g.changes}.isdisjoint((c.where, *c.ours) for c in h.changes):
+                tried.append(((g, h), left(h.apply(g.apply(first)))))
+        if len(told) > 2:
+            every = first
+            for h in told:
+                every = h.apply(every)
+            tried.append((tuple(told), left(every)))
+    return tried
+
+
+def nearest(tried: Sequence[_Try]) -> _Try:
+    """Return the causes that leave least; more causes only where they leave far less than fewer do."""
+    best, *others = sorted(tried, key=lambda x: (len(x[0]), _worst(x)))
+    for x in others:
+        if _worst(x) < _worst(best) * (PAIR_GAIN if len(x[0]) > len(best[0]) else 1.0):
+            best = x
+    return best
 
 
 def _fitted_velocity(world: World, motion: Motion, a: Record) -> Array:

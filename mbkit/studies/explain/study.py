@@ -18,6 +18,7 @@ from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import Path
 from mbkit.model.model import unchecked
 from mbkit.studies.explain import terms
+from mbkit.studies.explain.controlled_runs import Motion, with_engines
 from mbkit.studies.explain.engine_differences import engine_causes
 from mbkit.studies.explain.hypotheses import (
     CONSTRAINTS,
@@ -35,7 +36,7 @@ from mbkit.studies.explain.joint_matching import (
     rename_joints,
 )
 from mbkit.studies.explain.merged_model import MergedModel, Tolerances, merge, number_text, with_common_frames
-from mbkit.studies.explain.motion import MOTIONS, Compared, Motion, compare_motions, with_engines
+from mbkit.studies.explain.motion import MOTIONS, Compared, compare_motions
 from mbkit.studies.explain.records import compare_records
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.terms import WHOLE, Gap, Gaps, effects, larger, model_terms, states_of, worst

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar, cast
+from pathlib import Path
+from typing import Any, Final, TypeVar, cast
 
-from mbkit.engines.mujoco.settings import WORDS, Servo, Settings
-from mbkit.errors import InputError, UnsupportedError
+from mbkit.errors import InputError, LoadError, UnsupportedError
+from mbkit.methods.registry import method_of
+from mbkit.methods.simulation_settings import WORDS, Servo, Settings
 from mbkit.model import Model
 from mbkit.studies.explain.hypotheses import Change, Hypothesis
 from mbkit.studies.explain.merged_model import MergedModel, Where, merge
+from mbkit.studies.formatting import error_text
+from mbkit.studies.results import counted
 
+#: Largest difference of a file's run from that of its description, rad or m, over some tenths of a second.
+LIKE_THE_FILE: Final = 1e-7
 #: What a cause can change.
 Changed = TypeVar("Changed", bound="Model | Settings")
 
@@ -91,6 +98,49 @@ def _text(x: Any) -> str:
     if isinstance(x, tuple):
         return f"({', '.join(map(_text, x))})"
     return ("off", "on")[x] if isinstance(x, bool) else f"{x:g}" if isinstance(x, (int, float)) else str(x)
+
+
+def settings_text(x: Settings) -> str:
+    """Return settings in a few words."""
+    step = f", step {x.time_step:g} s" if method_of(str(x.integrator)).kind != "adaptive" else ""
+    drives = f", {counted(len(x.servos), 'drive')}" if x.servos else ""
+    return f"{x.engine}, {x.integrator}{step}{drives}, control every {x.control_period:g} s"
+
+
+def file_settings(path: str | Path, model: Model) -> tuple[Settings | None, tuple[str, ...]]:
+    """Return what a file says of its simulation, and what of that no run has; None for a URDF, which says nothing.
+
+    Parameters
+    ----------
+    path : str or Path
+        Of an MJCF: its options, limits and actuators are read by MuJoCo.
+    model : Model
+        The file's description, as `mbkit.load` returns it.
+
+    Raises
+    ------
+    LoadError
+        The file cannot be read, by mbkit or by MuJoCo.
+    """
+    if not str(path).lower().endswith((".xml", ".mjcf")):
+        return None, ()
+    from mbkit.engines.mujoco.simulation import OwnSimulation, settings_of
+    from mbkit.load.sanitized_text import strip
+
+    file = strip(Path(path))
+    try:
+        held, left = settings_of(file.text, file.meshes, {*model.joint_names})
+    except Exception as error:  # MuJoCo raises errors of many kinds
+        raise LoadError(f"{path}: MuJoCo does not read it: {' '.join(str(error).split())}") from None
+    pairs = [x for part in file.root.all("contact") for x in part.children]
+    off = None
+    with suppress(UnsupportedError):
+        off = OwnSimulation(model, held).off_the_file(file.text, file.meshes)
+    if off is None:
+        left.append("whether its run is that of mj_step")
+    elif not off <= LIKE_THE_FILE:
+        left.append(f"what its description lacks: mj_step on the file moves it {error_text(off)} rad or m otherwise")
+    return held, (*left, *([counted(len(pairs), "pair or exclusion of contact")] if pairs else []))
 
 
 def changed(change: Hypothesis | None, says: str, side: Changed, *, back: bool = False) -> Changed:
