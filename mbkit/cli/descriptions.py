@@ -98,8 +98,6 @@ def diff(
     if moved:
         settings |= {"motion": _motion(targets, sides, controller, bound, dt), "rollouts": rollouts}
     result = explain(*sides, names=names, **settings)
-    if path is not None:
-        _write(result, path, take)
     if not engines and (beside := _beside_terms(first, str(second))):
         unlike = not beside[0].startswith("not compared")
         head = "beside the terms: " if unlike else ""
@@ -107,6 +105,9 @@ def diff(
             # A motion says itself what of the files no run has.
             result = replace(result, beside=(f"{head}{beside[0]}", *beside[1:]), agree=result.agree and not unlike)
     shared.show(result.document(), as_json=as_json)
+    if path is not None:
+        # Shown before, so that nothing is lost where the file cannot be written.
+        _write(result, path, take)
     shared.leave(shared.AGREE if result.agree else shared.DIFFER)
 
 

@@ -170,6 +170,7 @@ def _root(J: Array, length: float) -> Array:
 #: Singular values below this part of the largest one are directions that the data cannot tell. The rest of
 #: geometry that counts as parallel is 1e-7 for base parameters; noise would be blown up as much.
 SINGULAR_VALUE_RATIO: Final = 1e-8
+_MAX_REWEIGHTINGS: Final = 10
 #: Change of variances between two rounds at which they are taken as settled.
 _VARIANCE_CHANGE: Final = 1e-3
 
@@ -214,7 +215,7 @@ def fit(equations: Sequence[Equations], start: Array, units: Array, *, weighted:
         Whether the equations have their weights already; else those of their noise are found.
     """
     noise = np.ones(len(equations))
-    for _ in range(10):
+    for _ in range(_MAX_REWEIGHTINGS):
         solution = _Solution(equations, noise, start, units)
         residuals = solution.residual_noise()
         if weighted:

@@ -28,6 +28,7 @@ Exact = Callable[[Array], Array]
 # VI.3 on singular perturbations, IV.5 on Radau IIA).
 
 _RADAU_STAGES: Final = 8
+_MAX_NEWTON_ITERATIONS: Final = 30
 
 #: F(y, ẏ), each (s, n), real or complex.
 Residual = Callable[[Any, Any], Any]
@@ -61,7 +62,7 @@ def _step(residual: Residual, y: Array, before: Array | None, h: float) -> Array
     J[np.arange(s), :, np.arange(s), :] += by_y
     inverse = np.linalg.inv(J.reshape(s * n, s * n))
     last = np.inf
-    for _ in range(30):
+    for _ in range(_MAX_NEWTON_ITERATIONS):
         change = (inverse @ residual(Y, slopes @ np.vstack([y, Y])).ravel()).reshape(s, n)
         Y = Y - change
         size = float(np.abs(change).max())
@@ -92,6 +93,8 @@ def _radau() -> tuple[Array, Array, BarycentricInterpolator]:
 
 
 _GRAVITY: Final = 9.81
+#: Steps a second: a taut chain hardly rings at frequencies above.
+_STEPS_PER_SECOND: Final = 200
 
 
 class HangingChain:
@@ -135,12 +138,14 @@ class HangingChain:
             return np.concatenate([rate[:, :n] - turn, forces / w], axis=1)
 
         start = np.concatenate([np.cumsum(q), np.zeros(n)])
-        # A taut chain hardly rings at frequencies above 200 steps a second.
-        solved = slow_motion(residual, start, duration, round(200 * duration))
+        solved = slow_motion(residual, start, duration, round(_STEPS_PER_SECOND * duration))
         return lambda t: np.diff(solved(t)[:, :n], axis=1, prepend=0.0)
 
 
 # Exact motions of linear systems.
+
+#: Rates of 1 and of 1e12 per second stand side by side.
+_DIGITS: Final = 50
 
 
 def linear(rates: ArrayLike, start: ArrayLike) -> Exact:
@@ -148,8 +153,7 @@ def linear(rates: ArrayLike, start: ArrayLike) -> Exact:
     A, x = np.asarray(rates, dtype=np.float64), np.asarray(start, dtype=np.float64)
 
     def motion(t: Array) -> Array:
-        # Rates of 1 and of 1e12 per second stand side by side.
-        with mp.workdps(50):
+        with mp.workdps(_DIGITS):
             states = [mp.expm(mp.matrix(A.tolist()) * mp.mpf(time)) * mp.matrix(x.tolist()) for time in t.tolist()]
             return np.array([[float(y) for y in state[: len(x) // 2, 0]] for state in states])
 
@@ -170,6 +174,9 @@ def slowest_mode(M: Array, stiffness: Array) -> tuple[float, Array, float]:
 
 
 # Exact motions of the pendulum and the cart-pole, in double.
+
+_QUADRATURE_NODES: Final = 128
+_TABLE_ROWS: Final = 4000
 
 
 def pendulum(theta: float, speed: float, square: float) -> Exact:
@@ -200,12 +207,12 @@ class _Phase:
     @staticmethod
     def integral(of: Exact, y: Array) -> Array:
         """Return ∫ of dy from 0."""
-        nodes, weights = leggauss(128)
+        nodes, weights = leggauss(_QUADRATURE_NODES)
         return np.asarray(y / 2 * (of(y[:, None] / 2 * (1 + nodes)) @ weights))
 
     def at(self, t: Array) -> Array:
         """Return the phase at times from 0 to the whole one."""
-        table = np.linspace(0, self._last, 4000)
+        table = np.linspace(0, self._last, _TABLE_ROWS)
         y = np.interp(t, self.integral(self._slope, table), table)
         for _ in range(4):
             y = np.clip(y + (t - self.integral(self._slope, y)) / self._slope(y), 0, self._last)

@@ -14,7 +14,7 @@ from mbkit.studies.explain.result import Explanation
 from mbkit.studies.results import write
 
 
-def write_causes(result: Explanation, path: Path, which: Sequence[int] = ()) -> list[str]:
+def write_causes(result: Explanation, path: Path, take: Sequence[int] = ()) -> list[str]:
     """Write the first description with causes taken over, read it back and compare; return notes.
 
     An MJCF has the settings of the simulation too: options and actuators. It has the motion alone, as
@@ -26,7 +26,7 @@ def write_causes(result: Explanation, path: Path, which: Sequence[int] = ()) -> 
         Of `explain` with a motion.
     path : Path
         Ends in .xml for an MJCF, in .urdf for a URDF.
-    which : sequence of int
+    take : sequence of int
         Numbers of causes, from 1, in the order of ``result.motion.effects``; all where there are none.
 
     Raises
@@ -41,11 +41,11 @@ def write_causes(result: Explanation, path: Path, which: Sequence[int] = ()) -> 
     if result.motion is None or result.motion.first is None:
         raise InputError("result: expected an explanation with motion=..., whose causes have numbers")
     effects, first = result.motion.effects, result.motion.first
-    if bad := [k for k in which if not 1 <= k <= len(effects)]:
-        raise InputError(f"which: expected numbers from 1 to {len(effects)}, got {bad}")
+    if bad := [k for k in take if not 1 <= k <= len(effects)]:
+        raise InputError(f"take: expected numbers from 1 to {len(effects)}, got {bad}")
     if path.exists():
         raise OutputError(f"{path} is there already; choose another")
-    world, notes, chosen = first, list[str](), [effects[k - 1] for k in which] or effects
+    world, notes, chosen = first, list[str](), [effects[k - 1] for k in take] or effects
     for effect in chosen:
         if effect.change is None or not effect.change.changes or effect.kind == "joint order":
             notes.append(f"not taken over, as no file holds it alone: {effect}")

@@ -51,6 +51,7 @@ _RIGID: Final = {"point": pin.ContactType.CONTACT_3D, "frame": pin.ContactType.C
 #: μ in terms of the largest pivot of J M⁻¹ Jᵀ. An iteration leaves μ / σ of the error along a singular value σ, and
 #: rounding of a redundant row, eps / μ, must stay small.
 _PROXIMAL_RATIO: Final = 1e-10
+_MAX_PROXIMAL_ITERATIONS: Final = 20
 _PROXIMAL_ACCURACY: Final = 1e-14
 #: Pivot of a row that may depend on the others, in terms of μ, which leaves about as much of it: LAPACK decides then.
 _DEPENDENT_PIVOT_RATIO: Final = 1e3
@@ -213,7 +214,7 @@ class PinConstraints:
         """Return v̇ of constraintDynamics under a force without h, all by Pinocchio; None where it is refused."""
         m, d, mu = self._m, self._d, self._mu
         models, data = self._rigid
-        settings = pin.ProximalSettings(_PROXIMAL_ACCURACY, _PROXIMAL_ACCURACY, mu, 20)
+        settings = pin.ProximalSettings(_PROXIMAL_ACCURACY, _PROXIMAL_ACCURACY, mu, _MAX_PROXIMAL_ITERATIONS)
         a: Array = pin.constraintDynamics(m, d, q, v, force, models, data, settings).copy()
         if not isfinite(sum(a.tolist())):
             return None

@@ -87,6 +87,7 @@ def normal_modes(system: Densities, count: int, values: Mapping[Any, float]) -> 
     names = [f.func.__name__ for f in system.jets.fields]
     shapes: list[Any] = []
     for mode in vectors:
+        # High powers cancel: the shapes keep 60 digits.
         own_shapes = [sp.Add(*(sp.Float(c, 60) * place**p for p, c in enumerate(rows))) for rows in mode]
         shapes.append(dict(zip(names, own_shapes, strict=True)) if len(names) > 1 else own_shapes[0])
     return NormalModes(np.sqrt(squares), tuple(shapes))

@@ -233,6 +233,7 @@ class CaseSweep:
 
 def _with_grace(seconds: float) -> float:
     """Return the processor time after which a process is ended that should have stopped by itself."""
+    # It may miss its limit by a quarter and half a second.
     return 1.25 * seconds + 0.5
 
 
