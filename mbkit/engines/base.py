@@ -338,7 +338,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
 
         `wrenches` on frames and their `axes` are those of `generalized_force`. Under constraints the first call warns
         where the state does not satisfy them; `constraint_residual` tells it of any. Where velocities with dry friction
-        are zero, it holds them as Gauss's principle has it, or lets them go (Moreau 1966, Comptes Rendus 262).
+        are zero, it holds them as Gauss's principle has it, or lets them go (Moreau 1966, Comptes Rendus 262); so do
+        joint stops.
 
         Examples
         --------
@@ -353,6 +354,27 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
             acting = frames, axes_named(axes)
             return self._evaluate("forward_dynamics_with_wrenches", *acting, q=q, v=v, tau=tau, wrenches=w)
         return self._evaluate("forward_dynamics", q=q, v=v, tau=tau)
+
+    def stop_forces(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
+        """Return the generalized forces of joint stops under τ, N m or N, shape (nv,) or (N, nv).
+
+        They are above zero at lower stops and below at upper ones, and zero where nothing rests on a stop. A force that
+        dry friction of the same joint could hold counts as the stop's.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> b = mb.ModelBuilder("block")
+        >>> b.add_body("block", mass=2.0)
+        >>> b.add_joint("z", "prismatic", parent="world", child="block", axis=(0, 0, 1), lower=0.0, stops=True)
+        >>> dyn = mb.dynamics(b.build())
+        >>> dyn.forward_dynamics([0.0], [0.0], [1.0]), dyn.stop_forces([0.0], [0.0], [1.0]).round(9)
+        (array([0.]), array([18.62]))
+        """
+        return self._evaluate("stop_forces", q=q, v=v, tau=tau)
+
+    def _stop_forces(self, q: Array, v: Array, tau: Array) -> Array:
+        return self._jumps.stop_forces(self, q, v, tau)
 
     def kinetic_energy(self, q: ArrayLike, v: ArrayLike) -> Any:
         """Return ½ vᵀ M v in J, a float or shape (N,).

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import CONSISTENT, EPS, ROUNDING, Array, batch_of
 from mbkit._imports import from_above
 from mbkit._reproducible import dependent, unit_rows
+from mbkit.engines.elements.stop_impacts import between_stops
 from mbkit.engines.evaluation import Evaluation
 from mbkit.errors import InputError, MbkitWarning, NumericalError, warn
 from mbkit.model.elements.paths import ALL, Path
@@ -338,7 +340,8 @@ class Constrained(Evaluation):
         """Return the nearest consistent state, in the metric of the mass matrix.
 
         The configuration goes onto f = 0, which rows that hold velocities alone have no part in; then the velocity goes
-        to where the rates of all rows are zero.
+        to where the rates of all rows are zero. Coordinates beyond joint stops go onto these, where impacts without
+        restitution take velocities that lead outwards.
 
         Parameters
         ----------
@@ -375,14 +378,21 @@ class Constrained(Evaluation):
         q, v = model.check_q(q), model.check_v(v)
         batch_of(q=q, v=v)
         states = self._states_held
+        stops = model.needs.stops
         if not model.constrained:
             states.held_parts(model, hold)
-            return q, v
+            return between_stops(self._jumps, self, q, v) if stops else (q, v)
         lead = np.broadcast_shapes(q.shape[:-1], v.shape[:-1])
         q, v = (np.broadcast_to(x, (*lead, x.shape[-1])) for x in (q, v))
-        if not lead:
+
+        def one(q: Array, v: Array) -> tuple[Array, Array]:
+            if stops:
+                return between_stops(self._jumps, self, q, v, partial(states.projected, self), hold)
             return states.projected(self, q, v, hold)  # type: ignore[no-any-return]  # by name
-        pairs = [states.projected(self, *pair, hold) for pair in zip(q, v, strict=True)]
+
+        if not lead:
+            return one(q, v)
+        pairs = [one(*pair) for pair in zip(q, v, strict=True)]
         return np.array([x for x, _ in pairs]).reshape(q.shape), np.array([x for _, x in pairs]).reshape(v.shape)
 
     def project_acceleration(self, q: ArrayLike, v: ArrayLike, a: ArrayLike, hold: Sequence[str] = ()) -> Array:

@@ -197,12 +197,14 @@ def load(
     actuators: bool = False,
     mount: ArrayLike | None = None,
     xacro: Mapping[str, str] | None = None,
+    stops: bool = False,
 ) -> Model:
     """Load a robot by name, or a URDF, MJCF or SDF: a file, its text, or a xacro file of a URDF.
 
     No other files are opened, except those that an MJCF includes, and the meshes that give a body of an MJCF its
     inertia. The model's ``notes`` name all decisions. Tendons of an MJCF act as springs and dampers, and the rotors of
-    its actuators act too; a tendon whose inertia changes with q is refused. Limits are data, off in every engine.
+    its actuators act too; a tendon whose inertia changes with q is refused. Limits are data, off in every engine,
+    without `stops`.
 
     Parameters
     ----------
@@ -242,6 +244,8 @@ def load(
     xacro : mapping of str to str, optional
         Arguments of a xacro file, as ``{"prefix": "left_"}``. The package xacro expands it, ``mbkit[xacro]``; such a
         file is a program that may read others, and its meshes are not drawn.
+    stops : bool
+        Whether the limits of the joints act as rigid stops, as by `Model.with_stops`.
 
     Returns
     -------
@@ -282,6 +286,7 @@ def load(
         ("floating_base", floating_base, (True, False), "True or False"),
         ("meshes", meshes, ("auto", "never"), "'auto' or 'never'"),
         ("actuators", actuators, (True, False), "True or False"),
+        ("stops", stops, (True, False), "True or False"),
     ):
         if not isinstance(value, (str, bool, np.bool_, NoneType)) or value not in allowed:
             raise InputError(f"{name}: expected {expected}, got {shown(value)}")
@@ -327,7 +332,8 @@ def load(
     if doubts:
         warn(f"{path}: engines may lose digits: {'; '.join(doubts)}", MbkitWarning)
     model = replace(model, notes=(*root.notes, *model.notes), source=file)
-    return model if mount is None else mounted(model, mount)
+    model = model if mount is None else mounted(model, mount)
+    return model.with_stops() if stops else model
 
 
 def _locate(source: str | os.PathLike[str]) -> tuple[Path, bool]:

@@ -9,7 +9,7 @@ proximal points, whose A is definite (Rockafellar 1976, SIAM Journal on Control 
 First all hold up to their bounds. Of those that would move, the one whose friction takes the most power lets go: on
 that side it has the friction of motion from then on, and the problem is solved again with what the others feel of it.
 It may come to hold after all. Each time a bound is lowered, so that there are 2 n at most, and the last is consistent:
-a joint holds within its bound, or moves against the friction of motion.
+a joint holds within its bound, or moves against the friction of motion. A joint at its stop has a bound on one side.
 """
 
 from __future__ import annotations
@@ -86,6 +86,9 @@ class Problem(NamedTuple):
     known: Any
     noise: Any
     shift: Any
+    #: 1 for joints at their lower stops, -1 at their upper ones, and the rounding of forces there; None without stops.
+    stop: Any = None
+    slack: Any = None
 
 
 class Signs(NamedTuple):
@@ -102,19 +105,27 @@ class Signs(NamedTuple):
     before: Any
 
 
-def noise(A: Array, b: Array, bound: Array) -> Array:
-    """Return the rounding of accelerations under forces up to their bounds, (N, n)."""
+def noise(A: Array, b: Array, bound: Array, stop: Array | None = None) -> Array:
+    """Return the rounding of accelerations under forces up to their bounds, or those that `stop` a joint, (N, n)."""
+    if stop is not None:
+        bound = bound + np.abs(stop * b) / np.abs(np.einsum("nii->ni", A))
     return np.asarray(FORCE_ROUNDING * (np.abs(b) + (np.abs(A) @ bound[..., None])[..., 0]))
 
 
 def exchange(o: Operations, p: Problem, s: Signs, n: int) -> tuple[Signs, Any, Any, Any]:
     """Return the signs after a round; with them the forces, which of them hold, and whether to go on."""
-    held, half = p.on * (1 - s.free), 0.5 * (s.high - s.low)
-    middle = o.choose(held, 0.5 * (s.low + s.high), o.choose(p.on, p.known, 0.0))
+    held, half, middle = p.on * (1 - s.free), 0.5 * (s.high - s.low), 0.5 * (s.low + s.high)
+    if p.stop is not None:
+        half = o.choose(p.stop != 0, 0.0, half)
+        middle = o.choose(p.stop > 0, s.low, o.choose(p.stop < 0, s.high, middle))
+    middle = o.choose(held, middle, o.choose(p.on, p.known, 0.0))
     fixed, inner = s.side * half, held * (s.side == 0)
     pushed = p.b + o.times(p.A, middle) - (0.0 if p.shift is None else p.shift * s.before)
     x = o.choose(inner, o.solved(p.own, -pushed - o.times(p.own, fixed), inner), fixed)
-    wrong = o.choose(inner, o.size(x) > half * (1 + ROUNDING), s.side * (pushed + o.times(p.own, x)) > p.noise)
+    beyond: Any = o.size(x) > half * (1 + ROUNDING)
+    if p.stop is not None:
+        beyond = o.choose(p.stop != 0, p.stop * x < -p.slack, beyond)
+    wrong = o.choose(inner, beyond, s.side * (pushed + o.times(p.own, x)) > p.noise)
     count = o.total(wrong)
     fewer, settled = count < s.best, count == 0
     change = o.choose((1 - fewer) * (s.left <= 0), wrong * (o.behind(wrong) == 1), wrong)
@@ -127,6 +138,9 @@ def exchange(o: Operations, p: Problem, s: Signs, n: int) -> tuple[Signs, Any, A
     # Forces of loops are not unique: what is at its bound may be held by the others, to the rounding of A.
     least = PROXIMAL_SHIFT / FORCE_ROUNDING * p.noise
     moves = s.side != 0 if p.shift is None else s.side * rate < -least
+    if p.stop is not None:
+        # What its stop neither pushes nor lets go rests.
+        moves = moves * o.choose(p.stop != 0, p.stop * rate > p.noise, 1.0)
     falls = moves * (o.size(forces) > p.less) * settled * (1 - near)
     power = o.choose(falls, o.size(rate) * p.bound, 0.0)
     # Joints whose power differs by less let go together, as rounding does not break a symmetry.

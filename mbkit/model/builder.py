@@ -16,7 +16,7 @@ from mbkit._check import TYPED, Array, finite_array, real, real_array, shown
 from mbkit._reproducible import length
 from mbkit.errors import InputError, ModelError, NonPhysicalWarning, nearest
 from mbkit.model.elements.declare import ElementBuilder
-from mbkit.model.elements.editing import NUMBERS_OF_JOINTS, EditingBuilder
+from mbkit.model.elements.editing import NUMBERS_OF_JOINTS, EditingBuilder, restitution_of
 from mbkit.model.elements.references import KINDS_OF_PARTS
 from mbkit.model.joint_types import FIXED, KINDS, JointType, kind_of
 from mbkit.model.loops import LOOP_KINDS, ROLLING_KINDS, LoopKind, RollingKind
@@ -340,6 +340,8 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
         stiction: ArrayLike | None = None,
         stribeck_velocity: ArrayLike | None = None,
         mimic: Mimic | tuple[str, Number, Number] | None = None,
+        stops: bool = False,
+        restitution: ArrayLike | None = None,
     ) -> None:
         """Add the joint that carries `child`.
 
@@ -360,7 +362,7 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
         pitch : float
             Helical: metres per radian.
         lower, upper, velocity_limit, effort_limit : float, (nq,) or (nv,) array_like, optional
-            Data, not dynamics.
+            Data, not dynamics, without `stops`.
         armature : float
             Added to M's diagonal, kg m² (kg for a prismatic joint); joints of one velocity, and ball joints.
         damping, stiffness, rest : float or (nv,) array_like
@@ -369,12 +371,17 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
             Dry friction, N m or N; the largest at rest, if another; and the velocity at which it falls to the first.
         mimic : Mimic or (joint, ratio, offset), optional
             The joint that this one follows.
+        stops : bool
+            Whether `lower` and `upper` are rigid stops, also of a joint that follows another.
+        restitution : float or (nv,) array_like, optional
+            Newton's e of an impact on a stop, from 0, the default, to 1.
         """
         read = self._read
         name = read.name("joint name", name)
         item = f"joint {name!r}"
         limits = lower, upper, velocity_limit, effort_limit
         numbers: Sequence[Any] = *limits, armature, damping, friction, stiffness, rest, stiction, stribeck_velocity
+        numbers = *numbers, restitution_of(read, name, stops, restitution)
         if not isinstance(kind, str) or kind not in KINDS:
             near = nearest(kind, KINDS) if isinstance(kind, str) else []
             read.faults.append(f"{item}: unknown kind {shown(kind)}; use one of {', '.join(near or KINDS)}")

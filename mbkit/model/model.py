@@ -297,7 +297,8 @@ class Model(Description):
         Parameters
         ----------
         *features : str
-            Any of damping, springs, armature, friction, gravity, limits, loops, couplers, prescribed, forces, no_slip.
+            Any of damping, springs, armature, friction, gravity, limits, stops, loops, couplers, prescribed, forces,
+            no_slip.
             Springs and damping are those of joints, point-to-point elements and couplings, armature that of joints
             and couplings; forces are those given by functions, with bushings and gravity compensation.
             Couplers go with the loops. Or kinds of `acts`, such as ``"joint.stiction"`` or ``"loop.revolute"``.
@@ -313,9 +314,23 @@ class Model(Description):
                 model = kind.removed(model)
         return model
 
+    def with_stops(self, restitution: float = 0.0) -> Model:
+        """Return the model in which the limits of all joints act as rigid stops, with Newton's restitution.
+
+        Limits of free and ball joints stay data.
+        """
+        e, finite = real("restitution", restitution), np.isfinite
+        joints = (
+            replace(j, restitution=np.full(j.type.nv, e))
+            if j.type.nv and j.type.coordinate_velocities and finite([j.lower, j.upper]).any()
+            else j
+            for j in self.joints
+        )
+        return replace(self, joints=tuple(joints))
+
     @property
     def smooth(self) -> Model:
-        """The model without forces that jump, such as dry friction; itself where it has none."""
+        """The model without what jumps, such as dry friction and stops; itself where it has none."""
         return self.without(*that_do("jump")) if "jump" in self.effects else self
 
     def lock(self, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike | None = None) -> Model:

@@ -124,6 +124,7 @@ def acting(part: Any, field: str) -> Any:
 
 _ORIENTED: Final = "orientations and axes are no parameters"
 _IS_DATA: Final = "it is data"
+_NEWTONS: Final = "Newton's restitution is a number in every engine, as set_joint sets it"
 _CURVE: Final = "Stribeck's curve is a number in every engine, as set_joint sets it"
 OF_Q: Final = ("type.suffixes",)
 OF_V: Final = ("type.velocity_suffixes",)
@@ -261,7 +262,7 @@ class Joint(_Frozen):
     pitch : float
         Advance of a helical joint, metres per radian.
     lower, upper : (nq,) arrays
-        Limits of the coordinates, infinite where there are none.
+        Limits of the coordinates, infinite where there are none: data, unless there are stops.
     velocity_limit, effort_limit, armature, damping, friction, stiffness, rest : (nv,) arrays
         Per velocity. `stiffness` acts on q - `rest`, `damping` on v, dry `friction` against v at any speed; the limits
         are data only.
@@ -269,6 +270,8 @@ class Joint(_Frozen):
         The joint that this one follows; its coordinate is then not free.
     stiction, stribeck_velocity : (nv,) arrays or None
         The largest dry friction at rest, that of motion without; and the velocity at which it falls to that.
+    restitution : (nv,) array or None
+        Newton's e of the stops at `lower` and `upper`, from 0 to 1; None where the limits are no stops.
     """
 
     section = "joints"
@@ -294,6 +297,7 @@ class Joint(_Frozen):
     stribeck_velocity: Annotated[Array | None, NumberRule("rad/s, m/s", OF_V, least=0.0, fixed=_CURVE, absent=0.0)] = (
         None
     )
+    restitution: Annotated[Array | None, NumberRule("", OF_V, least=0.0, fixed=_NEWTONS, absent=0.0)] = None
 
     def __repr__(self) -> str:
         follows = f", follows {self.mimic.joint!r}" if self.mimic else ""

@@ -58,6 +58,7 @@ equation | forward_dynamics | q v tau | nv | a | accelerations dv/dt under force
     | aba fd mj_forward qacc acc
 equation | kinetic_energy | q v | | T | kinetic energy, J |
 equation | potential_energy | q | | V | potential energy of gravity and springs, J |
+stop | _stop_forces | q v tau | nv | | |
 inverse | mass_matrix_inverse | q | nv nv | | | Minv computeMinverse compute_minverse
 rate | _energy_rate | q v a | | dE_dt | d(T + V)/dt at accelerations a, W |
 derivatives | _inverse_dynamics_derivatives | q v a | 3 nv nv | | | computeRNEADerivatives

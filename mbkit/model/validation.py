@@ -27,6 +27,7 @@ from mbkit.model.parts import (
     numbers,
     rest_faults,
 )
+from mbkit.model.stops import stop_faults
 from mbkit.spatial import skew
 
 # Fields that add to T along a joint's velocity.
@@ -299,7 +300,8 @@ def model_faults(model: Description) -> list[str]:
     faults += [
         f"body {n!r}: {why}" for n, why in impossible if not (n in accepted or n in static) or model.body(n).mass < 0
     ]
-    return faults
+    # The bounds of joints that follow others are known of a sound structure alone.
+    return faults or [*stop_faults(model)]
 
 
 _D = TypeVar("_D", bound=Description)

@@ -107,6 +107,10 @@ class Hit:
     q, v : (nq,) and (nv,) arrays
     member : int or None
         Which trajectory of a batch.
+    before : (nv,) array or None
+        Velocities before an impact on joint stops; of several stops at one time the first event has it.
+    energy_change : float
+        Energy that an impact on this stop changes, J.
     """
 
     name: str
@@ -114,6 +118,8 @@ class Hit:
     q: Array
     v: Array
     member: int | None = None
+    before: Array | None = None
+    energy_change: float = 0.0
 
     def __repr__(self) -> str:
         of = "" if self.member is None else f" (trajectory {self.member})"

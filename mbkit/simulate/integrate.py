@@ -18,6 +18,7 @@ from mbkit.methods.registry import ADAPTIVE_METHOD, DEFAULT_METHOD, EULER_METHOD
 from mbkit.model import Joint, Model
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import ALL, Path
+from mbkit.model.stops import StopLaw
 from mbkit.simulate import solvers
 from mbkit.simulate.checks import diagnostics, massless_joints
 from mbkit.simulate.constraint_projection import along_constraints, from_consistent
@@ -72,6 +73,8 @@ def integrate(
         if given and not getattr(chosen, name):
             others = ", ".join(m.name for m in METHODS.values() if getattr(m, name))
             raise UnsupportedError(f"{chosen.name}: {what} are not there with this method; use {others}")
+    if model.needs.stops and (beyond := StopLaw(model).beyond(q)):
+        raise InputError(f"q0: {beyond}; start between the stops, or where dyn.project(q, v) leads")
     _warn_beyond_limits(model, q)
     if model.jumping_forces:
         warn(

@@ -6,7 +6,7 @@ Result of a solver, and the cost and end of a run.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from typing import Any, Final, Literal
 
@@ -251,7 +251,7 @@ class RunData:
                 held = np.zeros(self._numbers) if force is None else force.between(t)
                 steps = _of_held(dyn, np.diff(t), q, v, held, self._acting)
         if "jump" in self.model.effects and not dyn._soft_jumps:
-            steps = steps - self._rubbed(dyn)
+            steps = steps - self._rubbed(dyn) + self._struck
         out = np.zeros(q.shape[:-1])
         np.cumsum(steps, axis=-1, out=out[..., 1:])
         return out
@@ -264,7 +264,9 @@ class RunData:
         out, which = np.zeros((len(rows), len(self.t) - 1)), dyn._jumps.law.which
         for i, row in enumerate(rows):
             # Phases end where a velocity whose force jumps is zero; other events part nothing.
-            ends = [x.t for x in self.events if x.member in (None, i) and (x.v[which] == 0).any()]
+            ends = [
+                x.t for x in self.events if x.member in (None, i) and (x.before is not None or (x.v[which] == 0).any())
+            ]
             around = [np.searchsorted(self.t, ends), np.searchsorted(self.t, ends, side="right") - 1]
             cuts = np.unique(np.clip([0, *around[0], *around[1], len(row) - 1], 0, len(row) - 1)).tolist()
             for a, b in pairwise(cuts):
@@ -278,15 +280,26 @@ class RunData:
         out = np.zeros((len(q), max(len(t) - 1, 0)))
         for i in range(len(q)):
             hits = [x for x in self.events if x.member in (None, i)]
-            times = np.append(t, [x.t for x in hits])
+            # An impact has velocities on both sides; a state that is kept there has the second.
+            hits = [y for x in hits for y in ([] if x.before is None else [replace(x, v=x.before)]) + [x]]
+            times = np.append([x.t for x in hits], t)
             order = np.argsort(times, kind="stable")
-            speeds = np.concatenate([v[i], *(x.v[None] for x in hits)])[order]
+            speeds = np.concatenate([*(x.v[None] for x in hits), v[i]])[order]
             moved = np.zeros((max(len(times) - 1, 0), v.shape[-1]))
-            moved[:, plain] = np.diff(np.concatenate([q[i], *(x.q[None] for x in hits)])[order][:, coordinates], axis=0)
+            moved[:, plain] = np.diff(np.concatenate([*(x.q[None] for x in hits), q[i]])[order][:, coordinates], axis=0)
             law = dyn._jumps.law_of(dyn._of_sample(i))
             taken = np.append(0.0, np.cumsum(law.dissipated(np.diff(times[order]), moved, speeds)))
-            out[i] = np.diff(taken[np.argsort(order)[: len(t)]])
+            out[i] = np.diff(taken[np.argsort(order)[len(hits) :]])
         return out.reshape(*self.q.shape[:-2], -1)
+
+    @property
+    def _struck(self) -> Array:
+        """The energy that impacts on stops change in each interval."""
+        out = np.zeros((*self.q.shape[:-2], max(len(self.t) - 1, 0)))
+        for x in self.events if out.size else ():
+            k = np.clip(np.searchsorted(self.t, x.t) - 1, 0, out.shape[-1] - 1)
+            out[... if x.member is None else x.member, k] += x.energy_change
+        return out
 
     def power_balance(self, engine: str | Dynamics | None = None) -> Array:
         """Return E(t) - E(0) - work(t) in J: zero for a run without error, shape (K,) or (N, K).

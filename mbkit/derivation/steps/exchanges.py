@@ -34,16 +34,21 @@ COLUMNS: Final = Operations(
 )
 
 
-def exchange_rounds(n: int) -> ca.Function:
+def exchange_rounds(n: int, *, stops: bool) -> ca.Function:
     """Return (A by rows, b, bound, less, on, known, noise, signs) -> (signs, forces, holds, going) after some rounds.
 
-    A is definite, so that there is no last point among the signs.
+    With `stops` their two arrays stand behind the noise. A is definite, so that there is no last point among the signs.
     """
     given = [ca.SX.sym(name, n) for name in Problem._fields[2:8]]
     square, state = ca.SX.sym("A", n * n), [ca.SX.sym(name, n) for name in Signs._fields[:4]]
     state += [ca.SX.sym(name) for name in Signs._fields[4:6]]
+    more: list[Any] = [ca.SX.sym(name, n) for name in Problem._fields[9:]] if stops else []
     A = ca.reshape(square, n, n)
-    problem, signs, out = Problem._make([A, A, *given, None]), Signs._make([*state, ca.SX(n, 1)]), list[Any]()
+    problem, signs, out = (
+        Problem._make([A, A, *given, None, *(more or (None, None))]),
+        Signs._make([*state, ca.SX(n, 1)]),
+        list[Any](),
+    )
     for _ in range(ROUNDS):
         signs, *out = exchange(COLUMNS, problem, signs, n)
-    return ca.Function("exchange_rounds", [square, *given, *state], [ca.densify(x) for x in (*signs[:6], *out)])
+    return ca.Function("exchange_rounds", [square, *given, *more, *state], [ca.densify(x) for x in (*signs[:6], *out)])

@@ -27,6 +27,7 @@ from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, 
 from mbkit.derivation.steps.symbols import SymbolicSpace, choose
 from mbkit.methods.exchanges import FORCE_ROUNDING, PATIENCE, PROXIMAL_SHIFT, ROUNDS, Problem, Signs, exchange
 from mbkit.model.parts import POSE_ROUNDING, RESTING, ROUNDING, STOPPED
+from mbkit.model.stops import StopLaw
 
 
 def holding(equations: Equations, q: Any, v: Any, a: Any, force: Any, parameters: Any) -> Any:
@@ -35,14 +36,17 @@ def holding(equations: Equations, q: Any, v: Any, a: Any, force: Any, parameters
     return needed - equations.applied(q, force)
 
 
-def phase_margin(equations: Equations, which: Sequence[int], sides: Sequence[str], locks: Sequence[str]) -> Part:
+def phase_margin(
+    equations: Equations, which: Sequence[int], sides: Sequence[str], locks: Sequence[str], stops: StopLaw
+) -> Part:
     """Return the part behind a step that tells how far its end is from that of its phase.
 
     It writes ``margins1`` of the velocities `which`, and the least of them, ``margin1``: the speed of one that slides,
-    of one that rests the part of its bound that is left, and 1 of one without a side; negative beyond. `sides` and
-    `locks` are the parameters of their sides and of rotors at rest. The part reads the largest forces at rest,
-    ``bound``. A margin is NaN where the parts of bounds are those of a linear program, as what rests follows from more
-    than one locked velocity. As ``q2`` and ``w2`` it writes the end with what rests where it was at ``q``, to the bit.
+    of one that rests the part of its bound that is left, and 1 of one without a side; beside stops the distance, or the
+    part of all forces that pushes it there; negative beyond. `sides` and `locks` are the parameters of their sides and
+    of rotors at rest. The part reads the largest forces at rest, ``bound``. A margin is NaN where the parts of bounds
+    are those of a linear program, as what rests follows from more than one locked velocity, or is at a stop beside
+    constraints. As ``q2`` and ``w2`` it writes the end with what rests where it was at ``q``, to the bit.
     """
     model, space, names = equations.model, SymbolicSpace(equations.model), list(equations.model.parameters)
     place, time = {name: i for i, name in enumerate(names)}, model.time_parameter
@@ -53,7 +57,8 @@ def phase_margin(equations: Equations, which: Sequence[int], sides: Sequence[str
         values = [x + dt * (name == time) for name, x in zip(names, ca.vertsplit(given), strict=True)]
         locked, side = (ca.vertcat(*(values[place[x]] for x in of)) for of in (locks, sides))
         locked, bound = locked > 0, ca.SX.sym("bound", len(which))
-        still = (side == 0) * (bound > 0)
+        rubs, ends = bound > 0, ca.DM(stops.which[list(which)].astype(float))
+        still = (side == 0) * (1 - (1 - rubs) * (1 - ends))
         pick = ca.DM(ca.Sparsity.triplet(len(which), model.nv, list(range(len(which))), list(which)), 1.0)
         ends = space.to_body_velocity(q, w)
         rests = ca.mtimes(pick.T, still)
@@ -72,7 +77,19 @@ def phase_margin(equations: Equations, which: Sequence[int], sides: Sequence[str
         else:
             # What holds a joint accelerates its rotor.
             left = 1 + ROUNDING - RESTING * ca.fabs(ca.mtimes(pick, a)) / bound
-        margins = choose(still, left, choose(side == 0, 1.0, side * speeds - STOPPED))
+        loose = choose(rubs * (side != 0), side * speeds - STOPPED, 1.0)
+        if stops:
+            pushed = still * ca.vertcat(*(_against(stops, i, start) for i in which))
+            if model.constrained:
+                left = left + choose(reduce(ca.fmax, ca.vertsplit(pushed**2)), np.nan, 0.0)
+            else:
+                none, own = ca.SX.zeros(model.nv), ca.vertcat(*values)
+                size = ca.fabs(equations.function("inverse_dynamics")(q, v, none, own)) + ca.fabs(tau[: model.nv])
+                size = reduce(ca.fmax, ca.vertsplit(size), ca.SX(np.finfo(float).tiny))
+                held = bound - pushed * RESTING * ca.mtimes(pick, a)
+                left = choose(pushed != 0, held / (bound + size) + ROUNDING, left)
+            loose = ca.fmin(loose, ca.vertcat(*(_from_stops(stops, i, q, v[int(i)]) for i in which)))
+        margins = choose(still, left, loose)
         results = [reduce(ca.fmin, ca.vertsplit(margins)), margins]
         results += [choose(_places(model, rests), start, q), choose(rests, 0.0, w)]
         arguments = dict(zip(reads, (start, q, w, tau, dt, bound, given), strict=True))
@@ -80,6 +97,24 @@ def phase_margin(equations: Equations, which: Sequence[int], sides: Sequence[str
 
     reads, writes = ("q", "q1", "w1", "tau", "dt", "bound", "parameters"), ("margin1", "margins1", "q2", "w2")
     return Part("phase_margin", reads, writes, make)
+
+
+def _against(stops: StopLaw, i: int, q: Any) -> Any:
+    """Return 1 where a velocity's coordinate is at its lower stop, -1 at its upper one, else 0."""
+    low, high = (x - r for x, r in zip(_distances(stops, i, q), stops.room[:, i], strict=True))
+    return (low <= 0) - (high <= 0)
+
+
+def _from_stops(stops: StopLaw, i: int, q: Any, v: Any) -> Any:
+    """Return the distance from the nearest stop, as `StopLaw.left` does."""
+    rooms, inwards = 0.5 * stops.room[:, i], (v >= 0, v <= 0)
+    return reduce(ca.fmin, (x + r * on for x, r, on in zip(_distances(stops, i, q), rooms, inwards, strict=True)))
+
+
+def _distances(stops: StopLaw, i: int, q: Any) -> list[Any]:
+    low, high = stops.bounds[:, i]
+    own = q[int(stops.places[i])]
+    return [own - low if np.isfinite(low) else ca.SX(np.inf), high - own if np.isfinite(high) else ca.SX(np.inf)]
 
 
 def _ways(equations: Any, which: Sequence[int]) -> ca.Function:

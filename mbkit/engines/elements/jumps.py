@@ -1,4 +1,4 @@
-"""Dry friction beside an engine's own terms: at speed a force, at rest a problem of complementarity.
+"""Dry friction and stops beside an engine's own terms: at speed a force, at rest a problem of complementarity.
 
 A joint at rest holds by any force up to s, or it begins to move against f <= s. Of s alone, accelerations minimize
 Gauss's function with the friction of what does not move (Moreau 1966, Comptes Rendus 262; Anitescu and Potra 1997,
@@ -8,7 +8,8 @@ Nonlinear Dynamics 14)::
 
 with one minimum. Its dual has a box alone: the forces λ_j of friction, |λ_j| <= s_j, with a = a0 + M⁻¹ λ. Where joints
 are bound by loops, M⁻¹ is the response of the accelerations to forces, and a is unique all the same. Where s is above
-f, a joint that would move has its bound lowered to f on that side, and the problem is solved again.
+f, a joint that would move has its bound lowered to f on that side, and the problem is solved again. A joint at rest
+on a stop has a >= 0 inwards, and so no bound on the forces that push it there (Moreau 1988; `mbkit.model.stops`).
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from mbkit.errors import MbkitWarning, NumericalError, UnsupportedError, warn
 from mbkit.methods.exchanges import ARRAYS, PATIENCE, PROXIMAL_SHIFT, Problem, Signs, exchange, noise, restricted
 from mbkit.model import Model
 from mbkit.model.changes.jumps import JumpLaw, Sliding, jump_bindings
+from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.parts import POSE_ROUNDING, RESTING
 
 #: Mask of the velocities at rest.
@@ -56,12 +58,13 @@ def jump_forces(
     known: Array,
     *,
     definite: bool = True,
+    stop: Array | None = None,
     rounds: Callable[[Problem, Signs], tuple[Signs, Any, Any, Any]] | None = None,
 ) -> tuple[Array, Mask]:
-    """Return the forces of friction at rest, and which of them hold; those `known` do not; (N, n).
+    """Return the forces of friction and stops at rest, and which of them hold; those `known` do not; (N, n).
 
-    A, (N, n, n), is positive definite or semidefinite. The way is that of `mbkit.methods.exchanges`; `rounds` makes
-    some of its rounds at once.
+    A, (N, n, n), is positive definite or semidefinite. `stop` has 1 and -1 for joints at their lower and upper stops.
+    The way is that of `mbkit.methods.exchanges`; `rounds` makes some of its rounds at once.
     """
     size, n = b.shape
     shift, own = None, A
@@ -70,7 +73,10 @@ def jump_forces(
         # To each its own: a joint that hardly responds takes as few points as the others.
         shift = PROXIMAL_SHIFT * np.where(diagonal > 0, diagonal, 1.0)
         own = A + shift[..., None] * np.eye(n)
-    problem = Problem(A, own, b, bound, less, on, known, noise(A, b, bound), shift)
+    least = noise(A, b, bound, stop)
+    problem = Problem(A, own, b, bound, less, on, known, least, shift)
+    if stop is not None:
+        problem = problem._replace(stop=stop, slack=least / np.abs(np.einsum("nii->ni", A)))
     low, high = np.where(known < 0, known, -bound), np.where(known > 0, known, bound)
     none, one = np.zeros(b.shape), np.ones((size, 1))
     signs = Signs(low, high, on & (known != 0), none, (n + 1.0) * one, PATIENCE * one, none)
@@ -97,6 +103,9 @@ class Jumps(AddedForce):
     def __init__(self, model: Model) -> None:
         self._model, self.law, self._varies = model, JumpLaw(model), bool(jump_bindings(model))
         self._constrained = model.constrained
+        self._words = " or ".join(
+            EFFECTS[x] for x, there in (("jump", model.needs.friction), ("stop", model.needs.stops)) if there
+        )
         #: A model, and that whose joints slide, for `phases`.
         self._slid: tuple[Model, Model] | None = None
 
@@ -118,29 +127,29 @@ class Jumps(AddedForce):
         return out
 
     def beside(self, quantity: str, method: Callable[..., Any], dyn: Any) -> Callable[..., Any]:
-        """Return an engine's method for a quantity with friction; terms of one with elements hold it at speed."""
+        """Return an engine's method for a quantity with friction and stops; one with elements holds it at speed."""
         law, moving = self.law_of(dyn), method if dyn._has_force_elements else super().beside(quantity, method, dyn)
         if quantity in UNDER_FORCE:
 
             def pushed(q: Array, v: Array, tau: Array, *rest: Any) -> Any:
-                resting = law.at_rest(v)
+                resting = law.at_rest(q, v)
                 if not resting.any():
                     return moving(q, v, tau, *rest)
                 if dyn._significand_bits > DOUBLE_BITS:
                     return self._in_phase(quantity, dyn, q, v, tau, rest, resting)
                 held, still = self._each(dyn, quantity, moving, q, v, tau, rest, resting)
                 out = moving(q, v, tau + padded(held, tau), *rest)
-                # A joint that friction holds does not move, not even by a rounding.
+                # A joint that friction or a stop holds does not move, not even by a rounding.
                 return np.where(still, 0.0, out) if quantity.startswith(_FORWARD) else out
 
             return pushed
         if quantity == "forward_dynamics_derivatives":
 
             def of_forward(q: Array, v: Array, tau: Array) -> Any:
-                if law.at_rest(v).any():
+                if law.at_rest(q, v).any():
                     warn(
-                        f"{self._model.name}: dry friction at rest has no derivative, and is left out of these; take "
-                        "model.without('friction') to do so knowingly, or velocities that are not zero",
+                        f"{self._model.name}: {self._words} at rest has no derivative, and is left out of these; take "
+                        "model.smooth to do so knowingly, or velocities that are not zero",
                         MbkitWarning,
                     )
                 return moving(q, v, tau)
@@ -149,10 +158,10 @@ class Jumps(AddedForce):
         if quantity in LOADS:
 
             def loaded(q: Array, v: Array, *rest: Any) -> Any:
-                if law.at_rest(v).any():
+                if law.at_rest(q, v).any():
                     raise UnsupportedError(
-                        f"loads of joints and loops: {self._model.name} has joints with dry friction at rest, whose "
-                        "share of the loads is not known; give velocities, or take model.without('friction')"
+                        f"loads of joints and loops: {self._model.name} has joints with {self._words} at rest, whose "
+                        "share of the loads is not known; give velocities, or take model.smooth"
                     )
                 return moving(q, v, *rest)
 
@@ -161,7 +170,7 @@ class Jumps(AddedForce):
 
     def warn_of_shares(self, dyn: Any, quantity: str, q: Array, v: Array, tau: Array) -> None:
         """Warn where joints rest together in fewer ways than there are joints: what holds them is not unique."""
-        if not (resting := self.law_of(dyn).at_rest(v)).any():
+        if not (resting := self.law_of(dyn).at_rest(q, v)).any():
             return
         still, N = np.atleast_2d(resting & (dyn.forward_dynamics(q, v, tau) == 0)), self.directions(dyn, q)
         N = np.broadcast_to(N, (len(still), *N.shape[-2:]))
@@ -228,10 +237,12 @@ class Jumps(AddedForce):
         bound, less = (np.broadcast_to(x, on.shape) for x in (law.bound, law.just_moving))
         known = np.zeros(on.shape) if leaving is None else (-leaving * law.just_moving).reshape(on.shape)
         definite, forces, holds = not self._constrained, np.zeros(on.shape), np.zeros(on.shape, dtype=bool)
-        w = self.law.which
+        w, stop = self.law.which, None
+        if law.stops:
+            stop = (law.stops.against(q) * resting).reshape(on.shape)[:, w]
         rounds = self._rounds(dyn) if definite and len(b) > 1 else None
         given: Any = A[:, w[:, None], w], *(x[:, w] for x in (b, bound, less, on, known))
-        forces[:, w], holds[:, w] = jump_forces(*given, definite=definite, rounds=rounds)
+        forces[:, w], holds[:, w] = jump_forces(*given, definite=definite, stop=stop, rounds=rounds)
         # A has the rounding of M; what the engine's own accelerations still leave corrects that.
         left = accelerate(tau + padded(forces.reshape(shape), tau))
         left = np.asarray(left, dtype=np.float64).reshape(on.shape)
@@ -245,10 +256,13 @@ class Jumps(AddedForce):
             return None
         from mbkit.derivation.steps.exchanges import exchange_rounds
 
-        code = dyn._code("exchange_rounds", make=lambda: exchange_rounds(size))
+        stops = bool(self.law.stops)
+        name = f"exchange_rounds{'_with_stops' * stops}"
+        code = dyn._code(name, make=lambda: exchange_rounds(size, stops=stops))
 
         def run(p: Problem, s: Signs) -> tuple[Signs, Any, Any, Any]:
-            out = code(p.A.reshape(len(p.A), -1), *p[2:8], *s[:6], threads=dyn.threads)
+            given = *p[2:8], *(p[9:] if stops else ()), *s[:6]
+            out = code(p.A.reshape(len(p.A), -1), *given, threads=dyn.threads)
             *signs, forces, holds, going = (x[..., 0] for x in out)
             return Signs._make([*signs, s.before]), forces, holds, going
 
@@ -307,6 +321,20 @@ class Jumps(AddedForce):
     def sliding(self) -> Sliding:
         """The model whose joints slide one way or rest."""
         return Sliding(self._model)
+
+    def stop_forces(self, dyn: Any, q: Array, v: Array, tau: Array) -> Array:
+        """Return the forces of stops on what rests there, zero elsewhere; (nv,) or (N, nv).
+
+        Where friction could hold a part, it holds none of it.
+        """
+        law, moving = self.law_of(dyn), dyn._without_jumps(_FORWARD)
+        moving = moving if dyn._has_force_elements else super().beside(_FORWARD, moving, dyn)
+        resting = law.at_rest(q, v)
+        if not (law.stops and resting.any()):
+            return np.zeros(v.shape)
+        side = law.stops.against(q) * resting
+        held, _ = self._each(dyn, _FORWARD, moving, q, v, tau, (), resting)
+        return np.asarray(side * np.maximum(side * held, 0.0))
 
     def _in_phase(
         self, quantity: str, dyn: Any, q: Array, v: Array, tau: Array, rest: tuple[Any, ...], resting: Mask

@@ -24,6 +24,7 @@ from mbkit.model.elements.formula import written
 from mbkit.model.model import Model, unchecked
 from mbkit.model.parameters import Binding, Expression, Parameter
 from mbkit.model.parts import RESTING, Joint, acting
+from mbkit.model.stops import StopLaw
 
 #: The number that holds what rests.
 _ROTOR: Final = Joint.adding_to("T")[0]
@@ -104,10 +105,13 @@ class JumpLaw:
         may = nominal.bound != 0
         for binding in jump_bindings(model):
             may[model.layout.full_v[binding.part].start + binding.index[0]] = True
-        #: Velocities with friction, whatever parameters are.
-        self.which = np.flatnonzero(may @ sizes)
+        #: Velocities with friction, whatever parameters are, or with stops.
+        self.stops = StopLaw(model)
+        self.which = np.flatnonzero((may @ sizes).astype(bool) | self.stops.which)
         #: That of a joint that has just let go, (nv,); its sign tells the side, and so it is zero nowhere else.
-        self.just_moving: Array = np.where(self.bound > 0, np.maximum(moving, np.finfo(float).tiny), 0.0)
+        self.just_moving: Array = np.where(
+            (self.bound > 0) | self.stops.which, np.maximum(moving, np.finfo(float).tiny), 0.0
+        )
 
     def of_samples(self, which: NDArray[np.intp]) -> JumpLaw:
         """Return the law of these samples, by index."""
@@ -151,9 +155,9 @@ class JumpLaw:
         ends, middle = ((own.at(x) - own.sliding) * np.abs(x) for x in (v, middle))
         return np.asarray(np.sum(own.sliding * path + h / 6 * (ends[1:] + 4 * middle + ends[:-1]), axis=1))
 
-    def at_rest(self, v: Array) -> NDArray[np.bool_]:
-        """Return where joints with friction have no velocity, of the shape of v."""
-        return np.asarray((v == 0) & (self.bound > 0), dtype=np.bool_)
+    def at_rest(self, q: Array, v: Array) -> NDArray[np.bool_]:
+        """Return where joints with friction, or at their stops, have no velocity, of the shape of v."""
+        return np.asarray((v == 0) & ((self.bound > 0) | (self.stops.against(q) != 0)), dtype=np.bool_)
 
 
 def held_at_rest(model: Model) -> str:
@@ -200,13 +204,16 @@ class Sliding:
         free = {(b.part, b.field, b.index[0]): b.expression for b in jump_bindings(model)}
         for joint in model.joints:
             part = layout.full_v[joint.name]
-            joints.append(replace(joint, friction=np.zeros(joint.type.nv), stiction=None, stribeck_velocity=None))
+            smooth: dict[str, Any] = {"friction": np.zeros(joint.type.nv), "stiction": None, "stribeck_velocity": None}
+            joints.append(replace(joint, restitution=None, **smooth))
             # A joint that follows by a ratio of zero does not move.
             own_free = {(field, k): x for (name, field, k), x in free.items() if name == joint.name}
-            if not (own_free or numbers.bound[part].any()) or not layout.G[part].any():
+            rows = [np.flatnonzero(layout.G[i])[0] for i in range(part.start, part.stop) if layout.G[i].any()]
+            # A joint with stops alone has a side too, by which its phase is told.
+            stops = not joint.mimic and self.law.stops.which[rows].any()
+            if not (own_free or numbers.bound[part].any() or stops) or not rows:
                 continue
             name = f"friction of {joint.name}"
-            rows = [np.flatnonzero(layout.G[i])[0] for i in range(part.start, part.stop)]
             signs = [float(np.sign(layout.G[part.start + k, i])) for k, i in enumerate(rows)]
             own = [k for k, i in enumerate(rows) if int(i) in self.sides]
             force, expressions = _force(name, joint, JumpNumbers(*(x[part] for x in numbers)), signs, own_free)

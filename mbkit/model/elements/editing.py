@@ -37,6 +37,15 @@ _MAX_NOTED_NUMBERS: Final = 3
 NUMBERS_OF_JOINTS: Final = tuple(n for n, rule in rules_of(Joint).items() if rule.shape in (OF_Q, OF_V))
 
 
+def restitution_of(read: Any, name: str, stops: object, restitution: Any) -> Any:
+    """Return the restitution of a joint's stops, None without; arguments that do not go together are faults."""
+    if not isinstance(stops, (bool, np.bool_)):
+        read.faults.append(f"joint {name!r}: stops: expected True or False, got {shown(stops)}")
+    elif restitution is not None and not stops:
+        read.faults.append(f"joint {name!r}: restitution without stops; give stops=True too")
+    return (0.0 if restitution is None else restitution) if stops else None
+
+
 class EditingBuilder:
     """Changes parts by name; `ModelBuilder` inherits it.
 
@@ -132,6 +141,7 @@ class EditingBuilder:
         axis2: ArrayLike | None = None,
         pitch: Number | None = None,
         mimic: Mimic | tuple[str, Number, Number] | EllipsisType | None = ...,
+        stops: bool | None = None,
         **numbers: _Numbers | ArrayLike | None,
     ) -> None:
         """Set a joint; the arguments, `numbers` among them, are those of `add_joint`. An infinite limit is no limit.
@@ -148,10 +158,14 @@ class EditingBuilder:
             )
             return
         given = self._known(f"joint {joint.name!r}", numbers, NUMBERS_OF_JOINTS)
+        if stops is not None or "restitution" in given:
+            there = joint.restitution is not None if stops is None else stops
+            given["restitution"] = restitution_of(self._read, name, there, given.get("restitution"))
         given |= {"axes": None if axis is None and axis2 is None else (axis, axis2)}
         given |= {} if mimic is ... else {"mimic": mimic}
         ready = self._joint_fields(joint.name, joint.type, {n: x for n, x in given.items() if x is not None})
         ready |= {"mimic": None} if mimic is None else {}
+        ready |= {} if stops is None or stops else {"restitution": None}
         if rotation is not None or rpy is not None:
             ready["rotation"] = self._read.orientation(f"joint {joint.name!r}", rotation, rpy)
         self._set("joints", name, {"translation": translation, "pitch": pitch}, ready)

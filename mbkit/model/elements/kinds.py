@@ -26,10 +26,12 @@ from mbkit.model.parts import rules_of
 _Model = Any
 _Test = Callable[[_Model, Any], bool]
 #: Effects of a kind, each with a word: coordinates, kinetic and potential energy, dissipation of a rate, a force that
-#: jumps with a velocity's sign, another force, a row of positions or of velocities, a limit that is data, the time.
+#: jumps with a velocity's sign, another force, a row of positions or of velocities, a limit that is data or that acts,
+#: the time.
 EFFECTS: Final[Mapping[str, str]] = MappingProxyType(
     {"q": "coordinates", "T": "rotors", "V": "springs and weights", "loss": "damping", "jump": "dry friction"}
     | {"force": "forces", "row": "constraints", "speed": "velocity constraints", "bound": "limits"}
+    | {"stop": "joint stops"}
     | {"t": "terms that depend on the time"}
 )
 _OF_TYPES: Final = "joint_type."
@@ -56,6 +58,7 @@ class Needs:
     time: bool
     forces: bool = False
     no_slip: bool = False
+    stops: bool = False
 
     def as_dict(self) -> dict[str, bool]:
         """Return the flags by name."""
@@ -243,12 +246,14 @@ _WORDS, _AT = "body {p.name!r} is armature of a free joint", lambda m, b: b.name
 register_kind("bodies", "body.rotor", _WORDS, "T", "mass inertia", "armature", _AT)
 _AT, _FRICTION = lambda _, j: j.mimic is not None, "friction stiction stribeck_velocity"
 register_kind("joints", "mimic", "joint {p.name!r} follows {p.mimic.joint!r}", "q", at=_AT)
+_stop = partial(register_kind, "joints", "joint.stop", "joint {p.name!r} has stops", "jump stop", "restitution")
+_stop("limits stops", lambda _, j: j.restitution is not None)
 for _name, _what, _does, _numbers, _feature in (
     ("armature", "armature", "T", "armature", "armature"),
     ("spring", "a spring", "V", "stiffness", "springs"),
     ("damping", "damping", "loss", "damping", "damping"),
     ("friction", "dry friction", "jump", _FRICTION, "friction"),
-    ("limit", "limits", "bound", "lower upper", "limits"),
+    ("limit", "limits", "bound", "lower upper restitution", "limits"),
     ("velocity_limit", "limits of velocity", "bound", "velocity_limit", "limits"),
     ("effort_limit", "limits of effort", "bound", "effort_limit", "limits"),
 ):

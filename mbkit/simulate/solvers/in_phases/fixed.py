@@ -26,7 +26,7 @@ from mbkit.simulate.problem import SIDE_BY_SIDE, IntegrationProblem, Solver
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.run_data import Ended, SolverResult
 from mbkit.simulate.singular_poses import SingularPoses
-from mbkit.simulate.solvers.in_phases.phases import Phase, Phases, force_of, of_each, side_by_side
+from mbkit.simulate.solvers.in_phases.phases import Impact, Phase, Phases, force_of, of_each, side_by_side
 from mbkit.simulate.solvers.stretches import MAX_EMPTY
 from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.time_grid import Grid, Indices
@@ -119,6 +119,8 @@ class _Members:
         self._sample(rows)
         dyn = self.phases.dyn._of_samples(self.members) if self.side_by_side else self.phases.dyn
         self.v = self.phases.stopped(dyn, start, self.q, self.v, self.v == 0)
+        self.v, _, impacts = self.phases.hit(dyn, start, self.q, self.v, self.forces(rows))
+        self._tell(impacts, rows, np.full(len(rows), grid.start))
         self._phase = self.begin(rows, start)
         parts = len(self.problem.q) // len(self.k)
         #: Ends of phases for each step of a trajectory in the last block, and the steps of the next one at most.
@@ -131,6 +133,13 @@ class _Members:
     def _end_early(self, row: int, ended: Ended, why: str) -> None:
         self._going[row] = False
         self._record.early[int(self.members[row])] = ended, why
+
+    def _tell(self, impacts: Sequence[Impact], rows: Indices, t: Array) -> None:
+        """Record impacts of rows in their states now."""
+        for x in impacts:
+            row, when = int(rows[x.row]), float(t[x.row])
+            member = None if self.problem.batch is None else int(self.members[row])
+            self._record.events.append(x.event(when, self.q[row].copy(), self.v[row].copy(), member))
 
     # Forces
 
@@ -366,7 +375,7 @@ class _Members:
     ) -> Indices:
         """Return how many states behind the first are of the phase, by their margins as far as these are known."""
         if margins is None:
-            margins = self.phases.speeds(phase, v[:, 1:]).min(axis=2, initial=1.0)
+            margins = self.phases.speeds(phase, q[:, 1:], v[:, 1:]).min(axis=2, initial=1.0)
             margins = np.where(phase.still.any(axis=1, keepdims=True) & (margins >= 0), np.nan, margins)
         good = _first(margins < 0, limit)
         row, step = np.nonzero(np.asarray(np.isnan(margins) & (np.arange(margins.shape[1]) < good[:, None])))
@@ -437,17 +446,18 @@ class _Members:
 
         `state` has margins behind q and v; `moved` tells that time has passed, `pushed` that it has at least begun to.
         """
-        v, leaving = self.phases.after(before, self.times(t), *state[:2], self.forces(rows), state[2])
+        given = self.times(t), *state[:2], self.forces(rows), state[2]
+        self.q[rows], self.v[rows], leaving, impacts = self.phases.after(before, *given)
+        self._tell(impacts, rows, t)
         self._empty[rows] = np.where(moved, 0, self._empty[rows] + 1)
         decided = self._empty[rows] <= MAX_EMPTY
         for i, time in zip(rows[~decided].tolist(), t[~decided].tolist(), strict=True):
             self._end_early(i, "step_too_small", f"{UNDECIDED} at t = {time:.9g} s: their phases end where they begin")
-        self.q[rows], self.v[rows] = state[0], v
         # A joint that let go and came to rest at once did not let go.
         after = self.begin(rows, self.times(later), leaving * (moved | pushed)[:, None])
         which = [None] * len(rows) if self.problem.batch is None else self.members[rows].tolist()
         at = [*zip(t.tolist(), self.q[rows], self.v[rows], which, strict=True)]
-        changes = self.phases.changes(before, after)
+        changes = self.phases.changes(before, after, self.q[rows], impacts)
         self._record.events += [Hit(name, *at[i]) for i, name in changes if decided[i]]
         return after, decided
 

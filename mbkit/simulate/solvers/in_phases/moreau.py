@@ -1,7 +1,7 @@
-"""Runs by Moreau and Jean's step: forces that jump with a fixed step, at any number of joints, without events.
+"""Runs by Moreau and Jean's step: forces that jump and stops with a fixed step, at any number of joints, no events.
 
 On the own derivation the step with its choice of sides is machine code; elsewhere, near singular poses of constraints,
-and under torques that are functions, the same problem is solved in Python for each step.
+beside stops and under torques that are functions, the same problem is solved in Python for each step.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mbkit._check import BOUND, Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
-from mbkit.engines.elements.jumps import jump_forces
+from mbkit.engines.elements.jumps import Mask, jump_forces
 from mbkit.errors import FunctionError, NumericalError
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
@@ -69,7 +69,7 @@ def run_moreau(problem: IntegrationProblem) -> SolverResult:
 
 def _compiles(problem: IntegrationProblem) -> bool:
     dyn = problem.dyn
-    known = dyn._derived and not problem.torque.callable and "jump" in dyn.model.effects
+    known = dyn._derived and not problem.torque.callable and dyn.model.needs.friction and not dyn.model.needs.stops
     if known and dyn.model.constrained and len(dyn._jumps.law.which) * dyn.model.nv > _MAX_RESPONSES:
         return False
     return known and bool(getattr(dyn, "_compiles_steps", False))
@@ -122,21 +122,40 @@ class _Stepper(Stepper):
             K = np.block([[M, J.mT], [J, np.zeros((len(q), len(chosen), len(chosen)))]])
             right = np.concatenate([np.zeros(v.shape), -rate], axis=1)[..., None]
             smooth = smooth + np.linalg.solve(K, right)[:, : v.shape[1], 0]
-        free, holds = smooth, v != v
-        if self._rubs.any():
-            slides = np.abs(self._law.force_at(v))
-            rests = v == 0
-            # A joint that stops or turns may be held by its stiction.
-            while True:
-                most = h * np.where(rests, self._law.bound, slides)
-                given = inverse, smooth, most, h * slides, self._rubs, np.zeros(v.shape)
-                impulse, holds = jump_forces(*given, definite=not bound)
-                free = np.where(holds, 0.0, smooth + (inverse @ impulse[..., None])[..., 0])
-                if not (turns := self._rubs & ~rests & (v * free <= 0) & (slides < self._law.bound)).any():
-                    break
-                rests = rests | turns
-        q1 = space.retract(q, h * space.to_integrator_velocity(q, free))
-        return self._phases.onto_rows(t + h, holds, q, q1, free) if bound else (q1, free)
+        stops, side = self._law.stops, self._law.stops.against(q)
+        while True:
+            free, holds = self._struck(h, v, smooth, inverse, side)
+            q1 = space.retract(q, h * space.to_integrator_velocity(q, free))
+            passed = np.where(side == 0, stops.passed(q1), 0.0)
+            if not passed.any():
+                break
+            # A stop that is reached within the step takes its part in all of it.
+            side = side + passed
+        start, ends = q, holds & (side != 0)
+        if ends.any():
+            start, q1 = stops.onto(q, ends), stops.onto(q1, ends)
+        return self._phases.onto_rows(t + h, holds & (free == 0), start, q1, free) if bound else (q1, free)
+
+    def _struck(self, h: float, v: Array, smooth: Array, inverse: Array, side: Array) -> tuple[Array, Mask]:
+        """Return the velocity behind a step with friction and the stops at these sides, and which of them hold."""
+        rubs, law = self._rubs, self._law
+        on = rubs | (side != 0)
+        if not on.any():
+            return smooth, on
+        # Newton's law: v⁺ + e v⁻ is zero or leads inwards.
+        back = np.where(side * v < 0, law.stops.restitution_at(side) * v, 0.0)
+        slides, rests = np.abs(law.force_at(v)), v == 0
+        # A joint that stops or turns may be held by its stiction.
+        while True:
+            most = h * np.where(rests, law.bound, slides)
+            given = inverse, smooth + back, most, h * slides, on, np.zeros(v.shape)
+            impulse, holds = jump_forces(
+                *given, definite=not self._dyn.model.constrained, stop=side if law.stops else None
+            )
+            free = np.where(holds, 0.0, smooth + back + (inverse @ impulse[..., None])[..., 0]) - back
+            if not (turns := rubs & ~rests & (v * free <= 0) & (slides < law.bound)).any():
+                return free, holds
+            rests = rests | turns
 
 
 class _Compiled:

@@ -1,19 +1,21 @@
-"""What slides and what rests: how it is decided, when it ends, and the smooth dynamics in between.
+"""What slides, rests or is at a stop: how it is decided, when it ends, and the smooth dynamics in between.
 
 Rest beside constraint rows: what rests with what, and how joints share the forces that hold it.
 
 The rows allow velocities v = N u. Joints rest in as many independent ways as their rows of N have; the
 others that rest follow from these. Forces λ hold them where Nᵀ λ is the force that is needed along N, and with more
 joints than ways λ is not unique. All stay at rest as long as some λ is within all bounds. The λ here is the one whose
-largest part of a bound is least, so that this part passes 1 where they let go.
+largest part of a bound is least, so that this part passes 1 where they let go. What its stop pushes has no bound; it
+lets go where no force is left that pushes it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from functools import partial
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy.optimize import linprog
@@ -24,17 +26,24 @@ from mbkit._reproducible import pivoted
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
 from mbkit.engines.elements.jumps import Mask
+from mbkit.engines.elements.stop_impacts import after_impacts, over
 from mbkit.errors import NumericalError
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.parts import POSE_ROUNDING, RESTING, ROUNDING, STOPPED
 from mbkit.simulate.constraint_projection import settled
+from mbkit.simulate.events import Hit
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force, Torque
 
 #: Part of a motion that is left where it stops, by the rounding of late times; at a dead centre all of it is.
 _LEFT: Final = 1e-3
+#: Time within which stops are reached at once, relative to times of 1 s or more: less than the error of any run.
+SIMULTANEOUS: Final = 1e-12
+#: Height of the last bounce, rad or m, relative to coordinates of 1 or more: of lower ones the rounding of coordinates
+#: would move the times more than their sum is.
+FLAT: Final = 1e-11
 #: Acceleration, relative to speeds of 1 or more: a speed that fades as c s², s before its end, is zero by rounding from
 #: where its rate is 2 √(c eps).
 _FADED: Final = 8 * float(np.sqrt(EPS))
@@ -71,7 +80,7 @@ def stopped(N: Array, v: Array, rests: Mask, rubs: Mask) -> Array:
     return np.where(rests | (held & rubs & (np.abs(out) <= slow(v))), 0.0, out)
 
 
-def shares(N: Array, needed: Array, bound: Array, still: Mask, locked: Mask) -> Array:
+def shares(N: Array, needed: Array, bound: Array, still: Mask, locked: Mask, stop: Array) -> Array:
     """Return the forces at joints that give the `needed` ones along N, zero where nothing rests, (m, nv).
 
     Parameters
@@ -80,6 +89,8 @@ def shares(N: Array, needed: Array, bound: Array, still: Mask, locked: Mask) -> 
     needed, bound : (m, nv) array
     still, locked : (nv,) array of bool
         What rests, and as many of it as rest in independent ways.
+    stop : (nv,) array
+        1 and -1 for joints at their lower and upper stops.
     """
     out, own = np.zeros(needed.shape), np.flatnonzero(still)
     ways = np.linalg.pinv(N[:, locked])
@@ -93,12 +104,37 @@ def shares(N: Array, needed: Array, bound: Array, still: Mask, locked: Mask) -> 
         columns = np.flatnonzero(label == part)
         rows = np.flatnonzero(linked[:, columns].any(axis=1))
         at, G = own[rows], R[:, rows][..., columns] * bound[:, own[rows], None]
+        if stop[at].any():
+            sizes = bound[:, at], np.abs(alone).max(axis=1)
+            given = R[:, rows][..., columns], alone[:, columns], *sizes
+            out[:, at] = [_pushed(*one, stop[at]) for one in zip(*given, strict=True)]
+            continue
         if len(columns) == 1:
             used = np.sign(G[..., 0]) * alone[:, columns] / np.abs(G[..., 0]).sum(axis=1, keepdims=True)
         else:
             used = np.array([_least(*one) for one in zip(G, alone[:, columns], strict=True)])
         out[:, at] = used * bound[:, at]
     return out
+
+
+def _pushed(R: Array, needed: Array, bound: Array, size: float, stop: Array) -> Array:
+    """Return the x with Rᵀ x = needed, of which none is near the end of what friction or a stop may give, (n,).
+
+    That is the least u with ``|x| <= u bound`` of joints without a stop, ``stop x >= size - u (bound + size)`` at one.
+    """
+    n, size = len(stop), size + np.finfo(float).tiny
+    if n == R.shape[1] == 1:
+        return np.asarray(needed / R[0])
+    at, free = np.diag(stop), np.diag(1.0 - np.abs(stop))
+    scale = np.where(stop != 0, bound / size + 1, bound / size)
+    limits = np.block([[-at, -scale[:, None]], [free, -scale[:, None]], [-free, -scale[:, None]]])
+    most = np.concatenate([np.where(stop != 0, -1.0, 0.0), np.zeros(2 * n)])
+    exact = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+    rows = np.column_stack([R.T, np.zeros(R.shape[1])])
+    found = linprog(np.eye(n + 1)[n], limits, most, rows, needed / size, (None, None), options=exact)
+    if found.x is None:
+        raise NumericalError(f"what holds {n} joints at rest on their stops is not known, as bounds differ much")
+    return np.asarray(found.x[:n] * size)
 
 
 def _least(G: Array, needed: Array) -> Array:
@@ -154,8 +190,36 @@ class Phase:
         return Phase(dyn, self.sides[which], self.still[which], self.locked[which], rubbed)
 
 
+class Impact(NamedTuple):
+    """An impact of a trajectory on a stop.
+
+    Attributes
+    ----------
+    row, velocity : int
+    name : str
+        Of the event.
+    delay : float
+        s from the impact to the event.
+    before : (nv,) array or None
+        The velocities before it, with the first of several at one time.
+    energy_change : float
+        J.
+    """
+
+    row: int
+    velocity: int
+    name: str
+    delay: float
+    before: Array | None = None
+    energy_change: float = 0.0
+
+    def event(self, t: float, q: Array, v: Array, member: int | None) -> Hit:
+        """Return the event of a run."""
+        return Hit(self.name, t + self.delay, q, v, member, self.before, self.energy_change)
+
+
 class Phases:
-    """Dry friction of one trajectory's dynamics, or of trajectories `side_by_side` on the own derivation."""
+    """Dry friction and stops of one trajectory's dynamics, or of trajectories `side_by_side` on the own derivation."""
 
     def __init__(self, dyn: Dynamics, *, side_by_side: bool = False) -> None:
         #: Whether constraints may hold with friction what rests.
@@ -164,14 +228,15 @@ class Phases:
             BESIDE_SOFT_ROWS.admit(dyn.model)
         self.dyn, self._own, self._side_by_side = dyn, dyn._jumps, side_by_side
         self._names = dyn.model.velocity_names
-        #: Velocities with friction. The law of all samples is made here, so that those of some are its rows.
-        self.which = self._own.law_of(dyn).which
+        #: Velocities with friction or stops. The law of all samples is made here, so that those of some are its rows.
+        law = self._own.law_of(dyn)
+        self.which, self._stops = law.which, law.stops
         self._rubs = np.isin(np.arange(dyn.model.nv), self.which)
         layout = dyn.model.layout
         places = (
             range(layout.q[j.name].start, layout.q[j.name].start + j.type.nv) for j in dyn.model.independent_joints
         )
-        # Joints with friction have a coordinate for each velocity.
+        # Such joints have a coordinate for each velocity.
         self._places = np.array([i for part in places for i in part], dtype=np.intp)[self.which]
 
     def phase(
@@ -190,8 +255,8 @@ class Phases:
         tau = applied(force, t, q, v)
         rubbed = self.dyn if members is None else self.dyn._of_samples(members)
         law = self._own.law_of(rubbed)
-        # A velocity whose friction is zero in these dynamics has no side, and so no phase.
-        resting, signs = law.at_rest(v), np.where(law.bound > 0, np.sign(v), 0.0)
+        # A velocity whose friction is zero in these dynamics has no side, but with a stop one that says that it moves.
+        resting, signs = law.at_rest(q, v), np.where(law.bound > 0, np.sign(v), 1.0 * self._stops.which)
         held, still = np.zeros(v.shape), np.zeros(v.shape, dtype=bool)
         if resting.any():
             rows: Any = np.flatnonzero(resting.any(axis=1)) if self._side_by_side else ...
@@ -209,7 +274,7 @@ class Phases:
                 stays = resting[rows] & fades(self._directions(own, when, q[rows]), v[rows], rate)
                 still[rows] |= stays if leaving is None else stays & (leaving[rows] == 0)
         locked = self._locked(rubbed, t, q, still)
-        return self.given(np.where(resting, -np.sign(held), signs), still, locked, rubbed)
+        return self.given(np.where(resting & (law.bound > 0), -np.sign(held), signs), still, locked, rubbed)
 
     def given(self, sides: Array, still: Mask, locked: Mask, rubbed: Dynamics) -> Phase:
         """Return a phase that is known."""
@@ -251,28 +316,49 @@ class Phases:
         return out
 
     def margins(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> Array:
-        """Return how far each velocity with friction is from the end of its phase, negative beyond; (k,) or (N, k).
+        """Return how far each velocity with friction or stops is from the end of its phase; (k,) or (N, k).
 
-        Of one that slides it is the speed, of one that rests the part of its bound that is left, and 1 without a side.
+        Of one that slides it is the speed, of one that rests the part of its bound that is left, and 1 without a side;
+        with a stop it is the distance, or the part of all forces that pushes the joint there. It is negative beyond.
         """
-        out = self.speeds(phase, v)
+        out = self.speeds(phase, q, v)
         still = phase.still[..., self.which]
         if still.any():
             held = np.where(phase.still, 0.0, v)
             bound = self.bounds(phase)
-            used = np.abs(self.holding(phase, t, q, held, force)[..., self.which]) / np.where(still, bound, 1.0)
-            out = np.where(still, 1 + ROUNDING - used, out)
+            at_rest = self.holding(phase, t, q, held, force)[..., self.which]
+            used = np.abs(at_rest) / np.where(still & (bound > 0), bound, 1.0)
+            left = 1 + ROUNDING - used
+            if self._stops and (side := self._pushed(phase, q)[..., self.which]).any():
+                size = self._size(phase, t, q, held, force)
+                left = np.where(side != 0, (bound + side * at_rest) / (bound + size) + ROUNDING, left)
+            out = np.where(still, left, out)
             if self._bound:
                 # A joint that rows alone hold moves as soon as they do.
                 moved = np.abs(v) / slow(v)
                 out = np.where(still & ~phase.locked[..., self.which], np.minimum(out, 1 - moved[..., self.which]), out)
         return out
 
-    def speeds(self, phase: Phase, v: Array) -> Array:
-        """Return the margins of velocities that slide, and 1 of the others; (k,), (N, k) or (m, N, k)."""
-        along = np.where(phase.still, 0.0, phase.sides)[..., self.which]
-        along = along[:, None] if v.ndim > along.ndim > 1 else along
-        return np.asarray(np.where(along == 0, 1.0, along * v[..., self.which] - STOPPED))
+    def _pushed(self, phase: Phase, q: Array) -> Array:
+        """Return 1 and -1 for what rests on lower and upper stops, of the shape of v."""
+        return np.where(phase.still, self._stops.against(q), 0.0)
+
+    def _size(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> Array:
+        """Return the size of the forces in a state, whose rounding is that of what pushes a joint to its stop."""
+        own = at_time(phase.dyn._bare or phase.dyn, t)
+        acts = np.abs(own.inverse_dynamics(q, v, 0 * v)) + np.abs(applied(force, t, q, v)[..., : v.shape[-1]])
+        return np.asarray(acts.max(axis=-1, keepdims=True, initial=np.finfo(float).tiny))
+
+    def speeds(self, phase: Phase, q: Array, v: Array) -> Array:
+        """Return the margins of what slides or may come to a stop, and 1 of others; (k,), (N, k) or (m, N, k)."""
+        rubs = np.broadcast_to(self._own.law_of(phase.rubbed).bound > 0, phase.still.shape)
+        along, loose = np.where(phase.still | ~rubs, 0.0, phase.sides)[..., self.which], ~phase.still[..., self.which]
+        if v.ndim > along.ndim > 1:
+            along, loose = along[:, None], loose[:, None]
+        out = np.where(along == 0, 1.0, along * v[..., self.which] - STOPPED)
+        if self._stops:
+            out = np.where(loose, np.minimum(out, self._stops.left(q, v)[..., self.which]), out)
+        return np.asarray(out)
 
     def margin_part(self, dyn: Any) -> Any:
         """Return the least margin as a part behind the steps of a phase's dynamics on the own derivation."""
@@ -280,7 +366,7 @@ class Phases:
 
         sliding, which = self._own.sliding, self.which.tolist()
         sides, locks = ([of[i] for i in which] for of in (sliding.sides, sliding.locks))
-        return phase_margin(dyn.equations, which, sides, locks)
+        return phase_margin(dyn.equations, which, sides, locks, self._stops)
 
     def holding(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> Array:
         """Return the forces of friction on what rests, and zero elsewhere; of the shape of v."""
@@ -298,12 +384,14 @@ class Phases:
         bound, out = np.ones(v.shape), np.zeros(v.shape)
         bound[..., self.which] = self.bounds(phase)
         N, needed, most = self._directions(phase.rubbed, t, q), _rows(pulled), _rows(bound)
-        patterns = _rows(np.concatenate([phase.still, phase.locked], axis=-1))
+        stop = self._pushed(phase, q)
+        shape = stop.shape
+        patterns = _rows(np.concatenate([*(np.broadcast_to(x, shape) for x in (phase.still, phase.locked)), stop], -1))
         patterns, which = np.unique(patterns, axis=0, return_inverse=True)
         which = np.broadcast_to(which, len(needed))
         for i, pattern in enumerate(patterns):
-            its, (still, locked) = which == i, np.split(pattern, 2)
-            _rows(out)[its] = shares(_rows(N, 2)[its], needed[its], most[its], still, locked)
+            its, (still, locked, pushed) = which == i, np.split(pattern, 3)
+            _rows(out)[its] = shares(_rows(N, 2)[its], needed[its], most[its], still > 0, locked > 0, pushed)
         return out
 
     def bounds(self, phase: Phase) -> Array:
@@ -313,25 +401,82 @@ class Phases:
 
     def after(
         self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force, margins: Array | None = None
-    ) -> tuple[Array, Array]:
-        """Return the velocity at the end of a phase, zero of what stopped there, and the signs of what lets go.
+    ) -> tuple[Array, Array, Array, list[Impact]]:
+        """Return the state at the end of a phase, the signs of what lets go, and the impacts on stops.
 
-        Those velocities end their phase that have the least margins, to rounding.
+        What stopped has no velocity. Those velocities end their phase that have the least margins, to rounding.
         """
         margins = self.margins(phase, t, q, v, force) if margins is None else margins
         ended = np.zeros(v.shape, dtype=bool)
         ended[..., self.which] = margins <= np.maximum(margins.min(axis=-1, keepdims=True), 0.0) + 1e-15
+        stops, arrives = ended & ~phase.still, np.zeros(v.shape, dtype=bool)
+        if self._stops:
+            arrives = ~phase.still & self._arriving(t, q, v)
+            # What comes to its stop slides on up to there.
+            stops &= ~arrives & (~self._stops.which | (np.abs(v) <= slow(v)))
         lets_go = ended & phase.still
-        out, leaving = np.where(phase.still | ended, 0.0, v), np.zeros(v.shape)
+        out, leaving = np.where(phase.still | stops, 0.0, v), np.zeros(v.shape)
         if self._bound:
-            out = self.stopped(phase.rubbed, t, q, v, phase.still | ended)
+            out = self.stopped(phase.rubbed, t, q, v, phase.still | stops)
         if lets_go.any():
             leaving = np.where(lets_go, -np.sign(self.holding(phase, t, q, v, force)), 0.0)
+            leaving = np.where(lets_go & ((side := self._pushed(phase, q)) != 0), side, leaving)
             if self._bound:
                 # Without a share in what holds, rows alone move it.
                 rate = at_time(phase.dyn, t).forward_dynamics(q, v, applied(force, t, q, v))
                 leaving = np.where(lets_go & (leaving == 0), np.sign(rate), leaving)
-        return out, leaving
+        if not arrives.any():
+            return q, out, leaving, []
+        q = self._stops.onto(q, arrives)
+        return q, *self.hit(phase.rubbed, t, q, out, force, leaving)
+
+    def _arriving(self, t: float | Array, q: Array, v: Array) -> Mask:
+        """Return which velocities lead to stops that are reached now, within the digits of a time."""
+        near = SIMULTANEOUS * np.maximum(1.0, np.abs(np.asarray(t)))[..., None, None]
+        speed = v[..., None, :] * np.array([[-1.0], [1.0]])
+        reached = self._stops.distance(q) <= self._stops.room + near * np.maximum(speed, 0.0)
+        return np.asarray((reached & (speed > 0)).any(axis=-2))
+
+    def hit(
+        self, rubbed: Dynamics, t: float | Array, q: Array, v: Array, force: Force, leaving: Array | None = None
+    ) -> tuple[Array, Array, list[Impact]]:
+        """Return the velocity after impacts on the stops that coordinates are at, what lets go, and the impacts.
+
+        Bounces that are lower than rounding are over, at the time to which their times add up.
+        """
+        leaving, side = np.zeros(v.shape) if leaving is None else leaving, self._stops.against(q)
+        impacts: list[Impact] = []
+        out, every = v.copy(), _rows(side * v)
+        rows: Any = np.flatnonzero((every < 0).any(axis=1))
+        if not len(rows):
+            return v, leaving, impacts
+        own, when = rubbed, t
+        if self._side_by_side:
+            own, when = rubbed._of_samples(rows), t[rows] if isinstance(t, np.ndarray) else t
+        own = at_time(own, when)
+        states, before, side = (_rows(x)[rows] for x in (q, v, side))
+        new, hits, taken = after_impacts(self._own, own, states, before)
+        _rows(out)[rows] = new
+        e, delays, ends, left = self._stops.restitution_at(side), np.zeros(new.shape), hits & False, taken
+        bounces = hits & (side * new > 0)
+        if bounces.any():
+            a = own.forward_dynamics(states, new, _rows(applied(force, t, q, out))[rows])
+            size = np.maximum(1.0, np.abs(np.where(side > 0, *self._stops.bounds)))
+            ends = bounces & (side * a < 0) & (new**2 <= 2 * np.abs(a) * FLAT * size)
+            if ends.any():
+                delays = np.where(ends & (e < 1), 2 * np.abs(new) / np.where(ends, np.abs(a) * (1 - e), 1.0), 0.0)
+                _rows(out)[rows], _, left = over(self._own, own, states, new, ends)
+        _rows(leaving)[rows] = 0.0
+        for k in np.flatnonzero(hits.any(axis=1)).tolist():
+            told: Array | None = before[k]
+            for i in np.flatnonzero(hits[k]).tolist():
+                name = partial(self._stops.event, i, side[k, i])
+                impacts.append(Impact(int(rows[k]), i, name("hits"), 0.0, told, float(taken[k, i])))
+                told = None
+                if ends[k, i]:
+                    last = float(delays[k, i]), None, float(left[k, i])
+                    impacts.append(Impact(int(rows[k]), i, name("comes to rest on"), *last))
+        return out, leaving, impacts
 
     def stopped(self, dyn: Dynamics, t: float | Array, q: Array, v: Array, rests: Mask) -> Array:
         """Return velocities of which some have come to rest, and with them those that constraints let rest too."""
@@ -341,14 +486,21 @@ class Phases:
         states = _rows(self._directions(dyn, t, q), 2), *map(_rows, (v, rests, rubs))
         return np.array([stopped(*state) for state in zip(*states, strict=True)]).reshape(v.shape)
 
-    def changes(self, before: Phase, after: Phase) -> list[tuple[int, str]]:
-        """Return which trajectory's velocity stops, lets go or turns from one phase to the next, in words."""
+    def changes(self, before: Phase, after: Phase, q: Array, impacts: Sequence[Impact] = ()) -> list[tuple[int, str]]:
+        """Return which trajectory's velocity stops, lets go or turns from one phase to the next, in words.
+
+        What rests after one of the `impacts` is not told of again.
+        """
         rested, rests = np.atleast_2d(before.still, after.still)
         turned = np.atleast_2d(before.sides * after.sides < 0) & self._rubs & ~(rested | rests)
-        out = []
+        side, hit, out = _rows(self._stops.against(q)), {(x.row, x.velocity) for x in impacts}, []
         for row, i in zip(*(x.tolist() for x in np.nonzero((rested != rests) | turned)), strict=True):
             what = "stops" if rests[row, i] else "lets go" if rested[row, i] else "turns"
-            out.append((row, f"{self._names[i]} {what}"))
+            if not side[row, i]:
+                out.append((row, f"{self._names[i]} {what}"))
+            elif rested[row, i] or (row, i) not in hit:
+                does = "comes to rest on" if rests[row, i] else "leaves"
+                out.append((row, self._stops.event(i, side[row, i], does)))
         return out
 
 

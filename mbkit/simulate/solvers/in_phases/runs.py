@@ -54,17 +54,20 @@ class _Friction:
 
     def first(self, t: float, q: Array, v: Array) -> Stretch:
         """Return the phase with which the run begins."""
-        v = self._phases.stopped(self._phases.dyn, t, q, v, v == 0)
-        return self._stretch(self._phases.phase(t, q, v, self._force(0)), t, q, v)
+        phases, force = self._phases, self._force(0)
+        v, _, impacts = phases.hit(phases.dyn, t, q, phases.stopped(phases.dyn, t, q, v, v == 0), force)
+        begins = [x.event(t, q, v, self._member) for x in impacts]
+        return self._stretch(phases.phase(t, q, v, force), t, q, v, begins)
 
     def _follow(self, phase: Phase, hit: Hit | None, t: float, q: Array, v: Array, moved: bool) -> Stretch | None:
         if hit is None or hit.name != _END:
             return None
         phases, force = self._phases, self._force(self._problem.interval(t))
-        v, leaving = phases.after(phase, t, q, v, force)
+        q, v, leaving, impacts = phases.after(phase, t, q, v, force)
         # A joint that let go and came to rest at once did not let go.
         new = phases.phase(t, q, v, force, leaving if moved else None)
-        changes = [Hit(name, t, q, v, self._member) for _, name in phases.changes(phase, new)]
+        changes = [x.event(t, q, v, self._member) for x in impacts]
+        changes += [Hit(name, t, q, v, self._member) for _, name in phases.changes(phase, new, q, impacts)]
         return self._stretch(new, t, q, v, changes)
 
     def _stretch(self, phase: Phase, begun: float, q: Array, v: Array, begins: Sequence[Hit] = ()) -> Stretch:
