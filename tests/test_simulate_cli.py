@@ -16,6 +16,7 @@ from click.testing import CliRunner, Result
 from mbkit import catalog, dynamics, simulate
 from mbkit.cli import cli
 from mbkit.studies import svg
+from tests.descriptions import links, robot, urdf_joint
 from tests.test_report import AGREEING, STUDY
 from tests.test_stress_report import RESULT
 
@@ -96,6 +97,21 @@ def test_the_engine_is_one_that_holds_the_system(target: str, engine: str) -> No
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_a_torque_saturates_where_asked(here: Path) -> None:
+    limit = '<limit lower="-2" upper="2" effort="5" velocity="3"/>'
+    (here / "arm.urdf").write_text(robot(links("base", "arm"), urdf_joint("j", "base", "arm", limit)))
+    push = "simulate", "arm.urdf", "--duration", "0.1", "--torque", "-8", "--force"
+    result = call(*push, "--saturate")
+    assert result.exit_code == 0, result.output
+    assert "torque on j clipped in 100 % of the run, first at t = 0 s, by at most 3" in result.stdout
+    rows = (here / "mbkit-report" / "arm-trajectory.csv").read_text().splitlines()
+    assert (rows[0].split(",")[-1], float(rows[-1].split(",")[-1])) == ("tau.j", -5.0)
+    data = json.loads(call(*push, "--saturate", "--json").stdout)
+    assert data["stats"]["saturated"] == [["j", 1.0, 0.0, 3.0]]
+    assert json.loads(call(*push, "--json").stdout)["stats"]["saturated"] == []
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_a_run_that_diverges_or_is_doubtful_has_status_1() -> None:
     wild = ("simulate", "double_pendulum", "--q0", "1.5,1", "--v0", "30,3", "--duration", "20", "--dt", "0.05")
     result = call(*wild, "--method", "semi_implicit_euler", "--json")
@@ -117,6 +133,8 @@ BAD = [
     (["simulate", "pendulum", "--q0", "random:x"], "--q0: expected neutral, random:SEED or 1 numbers"),
     (["simulate", "pendulum", "--v0", "a,b"], "--v0: expected neutral"),
     (["simulate", "pendulum", "--q0", "1,2"], "q0: expected shape (1,)"),
+    (["simulate", "pendulum", "--torque", "a"], "--torque: expected neutral"),
+    (["simulate", "pendulum", "--saturate"], "saturate: expected joints with effort_limit"),
     (["simulate", "pendulum", "--rtol", "1e-8"], "rtol"),
     (["simulate", "pendulum", "--save", "7"], "is not a step of dt"),
     (["simulate", "slider_crank", "--engine", "drake"], "constraints"),

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 @click.option("--q0", default="neutral", show_default=True, metavar="STATE", help="neutral, random:SEED or 1,-0.5.")
 @click.option("--v0", default="neutral", show_default=True, metavar="STATE", help="Its velocity; neutral is rest.")
 @click.option("--t0", type=float, help="First time, s, of motions and forces in time.  [default: the model's]")
+@click.option("--torque", metavar="STATE", help="Constant torque, such as 1,-0.5.  [default: none]")
+@click.option("--saturate", is_flag=True, help="Clip the torque to the effort limits.")
 @click.option("--save", type=click.IntRange(min=1), metavar="N", help="Keep the start and N more states, evenly.")
 @shared.load_options
 @shared.report_options
@@ -60,6 +62,7 @@ def simulate(
         report.prepare(f"{stem}-{name}", ending)
     dyn = _dynamics(model, settings.pop("engine"))
     start = _state("--q0", q0, dyn.model, 0), _state("--v0", v0, dyn.model, 1)
+    settings["torque"] = settings["torque"] and _state("--torque", settings["torque"], dyn.model, 1)
     first = dyn.model.time if settings["t0"] is None else settings["t0"]
     times = None if save is None else first + np.linspace(0.0, settings["duration"], save + 1)
     run = integrate(dyn, *start, save=times, progress=True, **{k: x for k, x in settings.items() if x is not None})

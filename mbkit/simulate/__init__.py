@@ -17,7 +17,7 @@ from mbkit.methods.registry import METHODS, Method, register_method
 from mbkit.methods.tableaus import RK4, ImplicitTableau, Tableau
 from mbkit.simulate.events import Event, Hit, at_energy, at_limits, at_section
 from mbkit.simulate.run import simulate
-from mbkit.simulate.run_data import Stats
+from mbkit.simulate.run_data import Saturation, Stats
 from mbkit.simulate.sensitivity import Sensitivities, sensitivities
 from mbkit.simulate.stiffness_measure import Stiffness, stiffness
 from mbkit.simulate.torque import Policy, StateFeedback
@@ -32,6 +32,7 @@ __all__ = [
     "Method",
     "Policy",
     "RunCheck",
+    "Saturation",
     "Sensitivities",
     "StateFeedback",
     "Stats",

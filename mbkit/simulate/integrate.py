@@ -25,7 +25,7 @@ from mbkit.simulate.constraint_projection import along_constraints, from_consist
 from mbkit.simulate.events import as_events
 from mbkit.simulate.problem import RUNS, SIDE_BY_SIDE, IntegrationProblem, RunRequest, Solver
 from mbkit.simulate.progress import Progress
-from mbkit.simulate.run_data import Acting, RunData, RunSettings, SolverResult
+from mbkit.simulate.run_data import Acting, RunData, RunSettings, SolverResult, saturated
 from mbkit.simulate.singular_poses import describe_poses
 from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, Indices, check_room, save_times
 from mbkit.simulate.torque import RunWrenches, Torque, TorqueFunction
@@ -66,10 +66,10 @@ def integrate(
     wanted, acting = as_events(request.events), _acting(dyn, request.wrenches, request.wrench_axes)
     span = start, start + duration, 0.0 if chosen.kind == "adaptive" else dt
     hold = _period(request, *span, (1 if batch is None else batch) * model.nv)
-    at_stages = None if hold else request.torque
+    at_stages, limits = None if hold else request.torque, _limits(model, request.saturate)
     functions = any(map(callable, [at_stages, *(request.wrenches or {}).values()]))
-    asked = ("events", wanted, "events"), ("wrenches on frames", acting, "wrenches")
-    for what, given, name in (*asked, ("torque functions", functions, "callables")):
+    optional = ("events", wanted, "events"), ("wrenches on frames", acting, "wrenches")
+    for what, given, name in (*optional, ("torque functions", functions, "callables")):
         if given and not getattr(chosen, name):
             others = ", ".join(m.name for m in METHODS.values() if getattr(m, name))
             raise UnsupportedError(f"{chosen.name}: {what} are not there with this method; use {others}")
@@ -95,7 +95,7 @@ def integrate(
             times = None if request.save is None else save_times(request.save, start, start + duration)
             whole = times is not None and times[0] == start and times[-1] == start + duration
             rows = len(times) - 1 if whole and times is not None else None
-            read, jumps = Torque(at_stages, model, batch, rows, request.wrenches), times
+            read, jumps = Torque(at_stages, model, batch, rows, request.wrenches, limits), times
             if hold:
                 jumps, begins, table = _intervals(times, start, duration, hold[0], rows=read.held)
                 read, times = read.sampled(hold[1], begins, table), jumps if times is None else times
@@ -106,7 +106,7 @@ def integrate(
             _refuse_tolerances(chosen, request.rtol, request.atol)
             grid = Grid.of(start, duration, dt)
             indices = grid.kept(request.save, (model.nq + model.nv) * (1 if batch is None else batch))
-            read = Torque(at_stages, model, batch, grid.steps, request.wrenches)
+            read = Torque(at_stages, model, batch, grid.steps, request.wrenches, limits)
             if hold:
                 steps = max(grid.steps, 1)
                 read = read.sampled(hold[1], [*range(0, steps, round(hold[0] / dt)), steps])
@@ -115,8 +115,9 @@ def integrate(
         if hold and not duration:
             # No step does.
             read.sample(0, start, q, v, None if batch is None else np.arange(batch))
-        applied = read.applied(jumps)
+        asked = read.applied(jumps)
         outcome = _outcome(problem, chosen, in_parts)
+        applied, clipped = saturated(asked, read.limits, model.velocity_names, start, outcome)
         passed = describe_poses(outcome.poses, batch, tolerance=chosen.kind == "adaptive")
         doubts = (passed, *outcome.doubts) if passed else outcome.doubts
     seconds = time.perf_counter() - started
@@ -129,7 +130,7 @@ def integrate(
         driven = applied is not None or model.driven_by_forces
         doubts += tuple(diagnostics(dyn, chosen, setting, states, driven=driven, steps=outcome.steps, work=work))
     message = outcome.message + ("" if outcome.last is None else massless_joints(dyn, outcome.last))
-    stats = outcome.stats(seconds=seconds, message=message, doubts=doubts)
+    stats = outcome.stats(seconds=seconds, message=message, doubts=doubts, saturated=clipped)
     kept = outcome.t, outcome.q, outcome.v
     data = RunData(*kept, model, chosen.name, dyn.engine, stats, dyn, outcome.events, applied, settings, acting)
     return data, outcome.error
@@ -154,6 +155,21 @@ def _period(
         raise InputError(f"hold: expected samples at times that differ, got {hold:g} s beside t = {end:g} s")
     check_room((end - start) / hold, numbers, f"hold: {hold:g} s makes", "sample less often")
     return hold, request.torque
+
+
+def _limits(model: Model, saturate: bool) -> Array | None:
+    """Return the effort limits of a run that saturates, (nv,); a warning names those of mimic joints."""
+    if not isinstance(saturate, (bool, np.bool_)):
+        raise InputError(f"saturate: expected True or False, got {saturate!r}")
+    if not saturate:
+        return None
+    mimics = ", ".join(j.name for j in model.joints if j.mimic and np.isfinite(j.effort_limit).any())
+    left_out = f"; those of mimic joints do not act in a run: {mimics}" if mimics else ""
+    if not np.isfinite(model.effort_limits).any():
+        raise InputError(f"saturate: expected joints with effort_limit=...; {model.name} has none{left_out}")
+    if left_out:
+        warn(f"{model.name}: saturate: effort limits act on independent joints{left_out}", MbkitWarning)
+    return model.effort_limits
 
 
 def _intervals(

@@ -48,6 +48,7 @@ class RunRequest:
     wrenches: RunWrenches | None = None
     wrench_axes: str = ALIGNED
     hold: float | None = None
+    saturate: bool = False
 
 
 #: Runs whose jumps are those of phases, or of the method.

@@ -41,6 +41,7 @@ def simulate(
     wrenches: RunWrenches | None = None,
     wrench_axes: str = ALIGNED,
     hold: float | None = None,
+    saturate: bool = False,
 ) -> Trajectory:
     """Integrate v̇ = forward_dynamics(q, v, τ), q̇ = D(q) v from one state or a batch.
 
@@ -104,6 +105,12 @@ def simulate(
         Period of a controller that samples, s: `torque` is called at the start and every `hold` seconds, with the state
         there, and its answer is held until the next call. A fixed step must divide it. On every method, MuJoCo's own
         too. Without `save`, an adaptive method keeps the states at the samples.
+    saturate : bool
+        Whether `torque`, of any kind, is clipped to the effort limits, ``model.effort_limits``; wrenches and passive
+        forces are not. A limit is on the torque of the joint's own velocity: those of mimic joints, whose forces are
+        part of the leader's torque, do not act, with a warning. ``Trajectory.tau`` and all that follows from it have
+        the clipped torque; `stats.saturated` has where, how often and by how much it was clipped. For that a function
+        without `hold` is called once more at each kept state; stages do not count.
 
     Returns
     -------
@@ -115,7 +122,7 @@ def simulate(
     Raises
     ------
     InputError
-        A wrong shape, state, time, tolerance, torque or wrench.
+        A wrong shape, state, time, tolerance, torque or wrench; `saturate` without an effort limit.
     TorqueError, EventError
         The function of the torque, of a wrench or of an event raised, or returned something else than (nv,) or (6,)
         finite numbers or one; the error's `trajectory` is the run up to then.
@@ -145,7 +152,7 @@ def simulate(
     """
     request = RunRequest(
         *(q0, v0, duration, method, dt, rtol, atol, torque, save),
-        *(progress, events, doubt, t0, wrenches, wrench_axes, hold),
+        *(progress, events, doubt, t0, wrenches, wrench_axes, hold, saturate),
     )
     error: FunctionError | None
     if isinstance(dyn, Dynamics):

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -21,9 +21,33 @@ from mbkit.methods.registry import Tolerances
 from mbkit.model import Body, Frame, Model
 from mbkit.simulate.events import Hit
 from mbkit.simulate.singular_poses import SingularPoses
-from mbkit.simulate.torque import Applied, ForceFunctions, PiecewiseConstantTorque, SampledTorque
+from mbkit.simulate.torque import Applied, ForceFunctions, PiecewiseConstantTorque, SampledTorque, within
 
 Ended = Literal["finished", "event", "diverged", "step_too_small", "function_failed"]
+
+
+class Saturation(NamedTuple):
+    """A velocity whose torque was clipped to its effort limit in a run with ``saturate=True``.
+
+    Attributes
+    ----------
+    velocity : str
+    fraction : float
+        Share of the time, over all trajectories of a batch; of a torque function, share of the kept states.
+    first : float
+        Time at which that began first, s; of a torque function, of the first such kept state.
+    excess : float
+        Largest amount of the torque beyond the limit, N or Nm.
+    """
+
+    velocity: str
+    fraction: float
+    first: float
+    excess: float
+
+    def __str__(self) -> str:
+        share = f"{100 * self.fraction:.3g} % of the run, first at t = {self.first:.6g} s"
+        return f"torque on {self.velocity} clipped in {share}, by at most {self.excess:.3g}"
 
 
 @dataclass(frozen=True)
@@ -53,6 +77,8 @@ class Stats:
         Of ``"auto"``: which methods ran, from when to when, and why.
     doubts : tuple of str
         Signs that a finished run is wrong, each with its measured reason and a remedy.
+    saturated : tuple of Saturation
+        With ``saturate=True``, the velocities whose torque was clipped: how often, from when on and by how much.
     """
 
     steps: int = 0
@@ -65,6 +91,7 @@ class Stats:
     jacobians: int = 0
     chosen: str = ""
     doubts: tuple[str, ...] = ()
+    saturated: tuple[Saturation, ...] = ()
 
     @property
     def finished(self) -> bool:
@@ -73,8 +100,8 @@ class Stats:
 
     def __str__(self) -> str:
         end = self.message or ("finished, with doubts" if self.doubts else "finished")
-        chosen = f"; {self.chosen}" if self.chosen else ""
-        return f"{self.steps} steps, {self.evaluations} evaluations, {self.seconds:.3g} s; {end}{chosen}"
+        more = "".join(f"; {x}" for x in (self.chosen, *self.saturated) if x)
+        return f"{self.steps} steps, {self.evaluations} evaluations, {self.seconds:.3g} s; {end}{more}"
 
 
 _FIGURES: Final = tuple(x.name for x in fields(Stats))
@@ -99,6 +126,31 @@ class SolverResult(Stats):
     def stats(self, **more: Any) -> Stats:
         """Return the cost and the end alone, with what else is known of them."""
         return Stats(**{name: getattr(self, name) for name in _FIGURES} | more)
+
+
+def saturated(
+    asked: Applied | None, limits: Array | None, names: tuple[str, ...], start: float, run: SolverResult
+) -> tuple[Applied | None, tuple[Saturation, ...]]:
+    """Return the force of a run within limits from the one that was asked for, and where the two differ."""
+    if asked is None or limits is None or isinstance(asked, SampledTorque):
+        return asked, ()
+    applied: Applied
+    if isinstance(asked, ForceFunctions) and not asked.functions[0][0].start:
+        t, force = run.t, asked.sampled(run.t, run.q, run.v, strict=False).values
+        weights, applied = 1.0 * np.isfinite(force).all(-1).reshape(-1, len(t)), SampledTorque(within(limits, force))
+    else:
+        # Functions are of wrenches alone, if there are some.
+        held = asked.held if isinstance(asked, ForceFunctions) else asked
+        t, force = np.array([start]) if held.starts is None else held.starts, held.rows
+        weights = np.diff(np.minimum(np.append(t, np.inf), np.atleast_2d(run.reached).T))
+        held = replace(held, rows=within(limits, force))
+        applied = replace(asked, held=held) if isinstance(asked, ForceFunctions) else held
+    excess, found = np.where(weights[..., None] > 0, (np.abs(force) - limits).reshape(-1, len(t), len(limits)), 0.0), []
+    for name, own in zip(names, np.moveaxis(excess, -1, 0), strict=False):
+        if (beyond := own > 0).any():
+            share, first = weights[beyond].sum() / weights.sum(), t[beyond.any(0).argmax()]
+            found.append(Saturation(name, float(share), float(first), float(own.max())))
+    return applied, tuple(found)
 
 
 #: Most states at once: the matrices of a long run would fill the memory.

@@ -7,7 +7,7 @@ its generalized force Σ Jᵀ w follows the configuration within a step (`mbkit.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
@@ -27,6 +27,11 @@ _DOUBLE = np.dtype(np.float64)
 TorqueFunction = Callable[[float, Array, Array], ArrayLike]
 #: Wrenches by the names of the frames on which they act.
 RunWrenches = Mapping[str, ArrayLike | TorqueFunction]
+
+
+def within(limits: Array | None, force: Array) -> Array:
+    """Return a force whose amounts are at most the limits, (n,); the same numbers where they are, or without limits."""
+    return force if limits is None else np.minimum(np.maximum(force, -limits), limits)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,10 +113,12 @@ class StateFeedback:
         for x in (self.gain, self.q, self.v, self.torque):
             x.setflags(write=False)
         self._constant = self.torque + self.gain @ np.concatenate([self.q, self.v])
+        #: Effort limits, (nv,), of a run that saturates.
+        self._limits: Array | None = None
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:  # noqa: ARG002  # the same at any time
         """Return the torque at one state, (nv,), or at those of a batch, (N, nv)."""
-        return np.asarray(self._constant - np.concatenate([q, v], axis=-1) @ self.gain.T)
+        return np.asarray(within(self._limits, self._constant - np.concatenate([q, v], axis=-1) @ self.gain.T))
 
     def __repr__(self) -> str:
         nv, nx = self.gain.shape
@@ -119,13 +126,15 @@ class StateFeedback:
 
     @property
     def pattern(self) -> str:
-        """Which entries of the gain are not zero, row after row, as hexadecimal digits of bits."""
-        return np.packbits(self.gain != 0).tobytes().hex()
+        """Which entries of the gain are not zero, row after row, and which torques are limited, as digits of bits."""
+        bits = [self.gain.ravel() != 0, *([] if self._limits is None else [np.isfinite(self._limits)])]
+        return np.packbits(np.concatenate(bits)).tobytes().hex()
 
     @property
     def numbers(self) -> Array:
-        """Constants, and entries of the gain that are not zero, as compiled steps take them."""
-        return np.append(self._constant, self.gain[self.gain != 0])
+        """Constants, entries of the gain that are not zero and limits, as compiled steps take them."""
+        limits = np.full(1, np.inf) if self._limits is None else self._limits
+        return np.concatenate([self._constant, self.gain[self.gain != 0], limits[np.isfinite(limits)]])
 
 
 class Policy:
@@ -198,6 +207,8 @@ class TorqueCallback:
 
     def many(self, t: float, q: Array, v: Array, members: Indices) -> Array:
         """Return the forces on states of these members of a batch, (m, size)."""
+        if isinstance(self.function, StateFeedback):
+            return self.checked(self.function(t, q, v), t, count=len(q))
         if not isinstance(self.function, Policy):
             each = zip(q, v, members.tolist(), strict=True)
             return np.array([self.one(t, *state).copy() for state in each]).reshape(-1, self.size)
@@ -240,12 +251,14 @@ def _when(t: float, member: int | None) -> str:
 Functions = tuple[tuple[slice, TorqueCallback], ...]
 
 
-def _on_one(functions: Functions, row: Array, t: float, q: Array, v: Array, member: int | None = None) -> Array:
-    """Return the force on one state, with the held numbers of a row."""
-    out = row.copy()
+def _on(
+    functions: Functions, rows: Array, t: float, q: Array, v: Array, members: Any = None, limits: Array | None = None
+) -> Array:
+    """Return the force on one state, or on those of these members of a batch, with the held numbers of rows."""
+    out = np.array(rows)
     for part, function in functions:
-        out[part] = function.one(t, q, v, member)
-    return out
+        out[..., part] = (function.one if q.ndim == 1 else function.many)(t, q, v, members)
+    return within(limits, out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,15 +272,17 @@ class ForceFunctions:
         """Return the values at saved states; NaN where one is not finite or, unless strict, a function fails."""
         held = self.held.at(t)
         rows = np.broadcast_to(held, (*v.shape[:-1], held.shape[-1]))
-        out = np.full(rows.shape, np.nan)
-        for index in np.ndindex(v.shape[:-1]):
-            if np.isfinite(q[index]).all() and np.isfinite(v[index]).all():
-                member = index[0] if len(index) == 2 else None
-                try:
-                    out[index] = _on_one(self.functions, rows[index], float(t[index[-1]]), q[index], v[index], member)
-                except TorqueError:
-                    if strict:
-                        raise
+        out, good = np.full(rows.shape, np.nan), np.isfinite(q).all(-1) & np.isfinite(v).all(-1)
+        groups: Iterable[Any] = zip(*np.nonzero(good), strict=True)
+        if v.ndim == 3 and all(isinstance(x.function, (Policy, StateFeedback)) for _, x in self.functions):
+            groups = ((np.flatnonzero(x), k) for k, x in enumerate(np.asarray(good.T)) if x.any())
+        for index in groups:
+            members = index[0] if v.ndim == 3 else None
+            try:
+                out[index] = _on(self.functions, rows[index], float(t[index[-1]]), q[index], v[index], members)
+            except TorqueError:
+                if strict:
+                    raise
         return SampledTorque(out)
 
 
@@ -308,7 +323,8 @@ class Torque:
 
     As an array, τ is (nv,), (steps, nv) or (batch, steps, nv), and a wrench (6,), (batch, 6), (steps, 6) or
     (batch, steps, 6); without `steps` nothing may change in time. A sampled torque is such a table, of which a
-    controller fills in each row when the run gets there (`sample`).
+    controller fills in each row when the run gets there (`sample`). Rows and functions have what is asked for; whoever
+    reads them gets τ within its `limits`.
     """
 
     #: When a sampled torque is asked; and which trajectory a part of a run is, and the step with which it begins.
@@ -323,6 +339,7 @@ class Torque:
         batch: int | None,
         steps: int | None,
         wrenches: RunWrenches | None = None,
+        limits: Array | None = None,
     ) -> None:
         parts: list[tuple[slice, Array]] = []
         functions: list[tuple[slice, TorqueCallback]] = []
@@ -357,6 +374,11 @@ class Torque:
             for part, x in parts:
                 self.table[..., part] = x
         self._functions: Functions = tuple(functions)
+        #: Effort limits of τ, and infinite ones of wrenches, (n,); None where the run does not saturate.
+        self.limits = None if limits is None else np.append(limits, np.full(size - model.nv, np.inf))
+        if self.feedback is not None and limits is not None:
+            self.feedback = copy(self.feedback)
+            self.feedback._limits = limits
 
     @classmethod
     def of_force(cls, force: Array, model: Model) -> Torque:
@@ -385,12 +407,12 @@ class Torque:
         """
         table, places = self.table, self._places(k, members)
         if table.ndim == 2:
-            return np.asarray(table[places])
+            return within(self.limits, np.asarray(table[places]))
         if members is None:
             members = slice(None)
         elif isinstance(members, np.ndarray) and not isinstance(places, slice):
             members = members[:, None]
-        return np.asarray(table[members, places])
+        return within(self.limits, np.asarray(table[members, places]))
 
     def _places(self, k: range | Indices, members: Any) -> slice | Indices:
         """Return which rows of the table act in steps."""
@@ -424,19 +446,16 @@ class Torque:
 
     def during(self, k: int, members: int | Indices | None) -> Force:
         """Return the force during step k on a single state, on one of a batch, or on these members of it."""
-        row, functions = self.table[..., self._place(k), :], self._functions
+        row, functions, limits = self.table[..., self._place(k), :], self._functions, self.limits
         if members is None or isinstance(members, int):
             row = row if row.ndim == 1 else row[members]
-            return partial(_on_one, functions, row, member=members) if functions else row
+            return partial(_on, functions, row, members=members, limits=limits) if functions else within(limits, row)
         rows = row[members] if row.ndim == 2 else np.broadcast_to(row, (len(members), len(row)))
         if not functions:
-            return rows
+            return within(limits, rows)
 
         def many(t: float, q: Array, v: Array, part: Any = slice(None)) -> Array:
-            out = np.array(rows[part])
-            for place, function in functions:
-                out[:, place] = function.many(t, q, v, members[part])
-            return out
+            return _on(functions, rows[part], t, q, v, members[part], limits)
 
         return many
 
@@ -519,7 +538,7 @@ class Torque:
         return [k - self._first for k in begins if 0 <= k - self._first < steps] if self._first else begins
 
     def applied(self, bounds: Array | None) -> PiecewiseConstantTorque | ForceFunctions | None:
-        """Return the force of a finished run, whose rows were held between `bounds`, s; None where it was zero."""
+        """Return the force that a run asks for, with rows held between `bounds`, s; None where it is zero."""
         if self.held:
             assert bounds is not None  # rows are read only where there are intervals
             which = slice(-1) if self.in_each_step or self.samples is None else self.samples.begins[:-1]

@@ -27,7 +27,7 @@ from mbkit.simulate.checks import CHECKED_TIMES, diagnostics
 from mbkit.simulate.events import Hit
 from mbkit.simulate.integrate import integrate
 from mbkit.simulate.problem import RunRequest
-from mbkit.simulate.run_data import RunData, RunSettings, Stats, dynamics_of_trajectory
+from mbkit.simulate.run_data import RunData, RunSettings, Saturation, Stats, dynamics_of_trajectory
 from mbkit.simulate.torque import PiecewiseConstantTorque, SampledTorque
 
 if TYPE_CHECKING:
@@ -313,7 +313,8 @@ class Trajectory(RunData):
             stats = about["stats"]
             reached = stats["reached"]
             stats |= {"reached": tuple(reached) if isinstance(reached, list) else reached}
-            known = Stats(**stats | {"doubts": tuple(stats["doubts"])})
+            clipped = tuple(Saturation(*x) for x in stats.get("saturated", ()))
+            known = Stats(**stats | {"doubts": tuple(stats["doubts"]), "saturated": clipped})
             parts = arrays["t"], arrays["q"], arrays["v"], model, about["method"], about["engine"], known
             digest, acting = about["digest"], about.get("wrenches")
             listed = zip(about.get("events", ()), arrays.get("event_q", ()), arrays.get("event_v", ()), strict=True)

@@ -139,18 +139,24 @@ def _prefix(method: str, thorough: bool, fed: str) -> str:
     return method_of(method).code_name + ("_thorough" if thorough else "") + gain
 
 
-def _entries(fed: str, q: Any, v: Any) -> tuple[list[int], list[int]]:
-    """Return rows and columns of the entries of a state feedback's gain that are not zero."""
-    bits = np.unpackbits(np.frombuffer(bytes.fromhex(fed), dtype=np.uint8), count=v.numel() * (q.numel() + v.numel()))
-    rows, columns = np.nonzero(bits.reshape(v.numel(), -1))
-    return rows.tolist(), columns.tolist()
+def _entries(fed: str, q: Any, v: Any) -> tuple[list[int], list[int], list[int]]:
+    """Return rows and columns of the entries of a state feedback's gain that are not zero, and limited torques."""
+    size = v.numel() * (q.numel() + v.numel())
+    # Bits that are not there are zeros: no torque is limited.
+    bits = np.unpackbits(np.frombuffer(bytes.fromhex(fed), dtype=np.uint8), count=size + v.numel())
+    rows, columns = np.nonzero(bits[:size].reshape(v.numel(), -1))
+    return rows.tolist(), columns.tolist(), np.flatnonzero(bits[size:]).tolist()
 
 
 def _fed(fed: str, law: Any, q: Any, v: Any) -> Any:
-    """Return the torque of a state feedback with these numbers, its constants and the entries of its gain."""
+    """Return the torque of a state feedback with these numbers, its constants, the entries of its gain and limits."""
     nv, x = v.numel(), ca.vertcat(q, v)
-    gain = ca.SX.triplet(*_entries(fed, q, v), law[nv:], nv, x.numel())
-    return law[:nv] - gain @ x
+    rows, columns, limited = _entries(fed, q, v)
+    behind = nv + len(rows)
+    torque = law[:nv] - ca.SX.triplet(rows, columns, law[nv:behind], nv, x.numel()) @ x
+    for i, limit in zip(limited, ca.vertsplit(law[behind:]), strict=True):
+        torque[i] = ca.fmin(ca.fmax(torque[i], -limit), limit)
+    return torque
 
 
 def march_in_stages(equations: Equations, method: str, *, thorough: bool = False, fed: str = "") -> tuple[Part, ...]:
@@ -251,7 +257,7 @@ def _symbols(equations: Equations, fed: str = "") -> dict[str, Any]:
     nq, nv = equations.model.nq, equations.model.nv
     sizes = {"q": nq, "v": nv, "w": nv, "tau": equations.force.numel(), "dt": 1, "squares": 1}
     if fed:
-        sizes[LAW] = nv + len(_entries(fed, equations.q, equations.v)[0])
+        sizes[LAW] = nv + sum(map(len, _entries(fed, equations.q, equations.v)[1:]))
     return {**{name: ca.SX.sym(name, n) for name, n in sizes.items()}, **equations.extra_arguments}
 
 

@@ -46,6 +46,7 @@ from mbkit.simulate.solvers.machine_code_blocks import (
 from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.solvers.vector_field import are_bounded
 from mbkit.simulate.time_grid import Indices
+from mbkit.simulate.torque import within
 
 #: Bytes of held torques that go to the GPU at once.
 _MAX_TORQUE_BYTES: Final = 2**28
@@ -312,6 +313,8 @@ def _run_step_by_step(problem: IntegrationProblem) -> SolverResult:
     ask, nv, timed = controller.function, dyn.model.nv, dyn.model.time_parameter is not None
     # A step whose force is the answer alone.
     step: Any = dyn._single_step(method) if forces.shape[1] == nv and not dyn.model.parameters else None
+    # Its answers are kept as they are, and go into the step as they are.
+    plain = step is not None and torque.limits is None
     q, v, start, dt, steps, force = problem.q0, problem.v0, grid.start, grid.dt, grid.steps, forces[0]
     row = int(record.kept[0] == 0)
     kept = iter(record.kept[row:].tolist())
@@ -326,10 +329,10 @@ def _run_step_by_step(problem: IntegrationProblem) -> SolverResult:
                 if k == sample:
                     # Copies: the function may write into them.
                     force = ask(start + k * dt, q.copy(), v.copy())
-                    if step is None:
+                    if not plain:
                         forces[s, :nv] = controller.checked(force, start + k * dt)
-                        force = forces[s]
-                    s, new = s + 1, True
+                        force = within(torque.limits, forces[s])
+                    s, new = s + 1, plain
                     sample = begins[s]
                 state = None if step is None else step(q, v, force, h, 0.0)
                 if state is None:
