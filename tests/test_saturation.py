@@ -146,6 +146,27 @@ def test_a_torque_within_limits_changes_no_bit(name: str) -> None:
     assert same(run_of(name, None, saturate=True), run_of(name, None))
 
 
+@pytest.mark.parametrize("hold", [None, 0.02])
+@pytest.mark.parametrize(("engine", "method"), [("compiled", "rk4"), ("pinocchio", "rk853"), ("compiled", "moreau")])
+def test_stops_and_effort_limits_act_together(engine: str, method: str, hold: float | None) -> None:
+    b = mb.ModelBuilder("struck")
+    wall = {"upper": 0.02, "stops": True, "restitution": 0.4}
+    b.add_joint("x", "prismatic", parent="world", child="cart", axis=(1, 0, 0), effort_limit=1.5, **wall)
+    b.add_body("cart", mass=1.0, inertia=np.eye(3))
+    dyn = dynamics_of(engine, b.build())
+    setting: dict[str, Any] = {"dt": 0.01} if METHODS[method].kind == "fixed" else {"save": np.linspace(0.0, 0.3, 4)}
+    push = lambda t, q, v: [40.0 * (0.05 - q[0])]  # noqa: E731
+    cut = lambda t, q, v: np.clip(push(t, q, v), -1.5, 1.5)  # noqa: E731
+    for start in (([0.0], [0.1]), (np.zeros((2, 1)), [[0.1], [0.3]])):
+        runs = [
+            mb.simulate(dyn, *start, 0.3, method, torque=torque, hold=hold, saturate=saturate, doubt=False, **setting)
+            for torque, saturate in ((push, True), (cut, False))
+        ]
+        assert same(*runs)
+        assert runs[0].stats.saturated
+        assert len(runs[0].events) == len(runs[1].events)
+
+
 # State feedback
 
 GAIN = np.array([[8.0, 0.0, 6.0, 0.0], [0.0, 2.0, 0.0, 0.5]])
