@@ -28,6 +28,7 @@ from mbkit.errors import DeviceError, InputError, UnknownNameError, UnsupportedE
 from mbkit.simulate.solvers import compiled_fixed_step
 from tests.fake_cuda import FakeDriver, fake  # noqa: F401  # a fixture
 from tests.random_trees import off, random_tree
+from tests.test_saturation import crane
 from validation import gpu as study
 
 pytestmark = [
@@ -150,6 +151,19 @@ def test_runs_have_the_bits_of_the_cpu(name: str, method: str, torque: str, monk
     assert np.array_equal(found.q, want.q)
     assert np.array_equal(found.v, want.v)
     assert np.array_equal(found.t, want.t)
+
+
+def test_a_feedback_within_effort_limits_has_the_bits_of_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    cpu, gpu = both(crane())
+    q, v = np.random.default_rng(4).normal(size=(2, 7, 2))
+    run: dict[str, Any] = {"duration": 0.02, "dt": 1e-3, "save": 8, "saturate": True, "doubt": False}
+    run["torque"] = mb.simulate.StateFeedback(np.hstack([3 * np.eye(2), np.eye(2)]))
+    want = mb.simulate(cpu, q, v, **run)
+    without_reruns(monkeypatch)
+    found = mb.simulate(gpu, q, v, **run)
+    assert np.array_equal(found.v, want.v)
+    assert found.stats.saturated == want.stats.saturated
+    assert 0 < want.stats.saturated[0].fraction < 1
 
 
 def test_a_step_in_stages_is_the_same_to_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
