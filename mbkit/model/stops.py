@@ -101,7 +101,7 @@ class StopLaw:
 
     def restitution_at(self, against: Array) -> Array:
         """Return e of the stops that coordinates are at, (..., nv)."""
-        return np.where(against > 0, self.restitution[0], self.restitution[1])
+        return np.asarray(np.where(against > 0, self.restitution[0], self.restitution[1]))
 
     def event(self, i: int, side: float, does: str) -> str:
         """Return words such as "j1 hits its upper stop" for the stop that pushes a velocity to a side."""

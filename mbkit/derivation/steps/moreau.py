@@ -37,7 +37,7 @@ def holding(equations: Equations, q: Any, v: Any, a: Any, force: Any, parameters
 
 
 def phase_margin(
-    equations: Equations, which: Sequence[int], sides: Sequence[str], locks: Sequence[str], stops: StopLaw
+    equations: Equations, which: Sequence[int], sides: Sequence[str | None], locks: Sequence[str], stops: StopLaw
 ) -> Part:
     """Return the part behind a step that tells how far its end is from that of its phase.
 
@@ -55,8 +55,12 @@ def phase_margin(
         q, w, dt, start = (ca.SX.sym(x, n) for x, n in (("q1", model.nq), ("w1", model.nv), ("dt", 1), ("q", model.nq)))
         tau, given = ca.SX.sym("tau", equations.force.numel()), ca.SX.sym("parameters", len(names))
         values = [x + dt * (name == time) for name, x in zip(names, ca.vertsplit(given), strict=True)]
-        locked, side = (ca.vertcat(*(values[place[x]] for x in of)) for of in (locks, sides))
-        locked, bound = locked > 0, ca.SX.sym("bound", len(which))
+        locked, bound = ca.vertcat(*(values[place[x]] for x in locks)), ca.SX.sym("bound", len(which))
+        # Without friction the rotor tells whether a joint rests.
+        side = ca.vertcat(
+            *(lock <= 0 if x is None else values[place[x]] for x, lock in zip(sides, ca.vertsplit(locked), strict=True))
+        )
+        locked = locked >= RESTING
         rubs, ends = bound > 0, ca.DM(stops.which[list(which)].astype(float))
         still = (side == 0) * (1 - (1 - rubs) * (1 - ends))
         pick = ca.DM(ca.Sparsity.triplet(len(which), model.nv, list(range(len(which))), list(which)), 1.0)

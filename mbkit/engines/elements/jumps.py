@@ -29,7 +29,7 @@ from mbkit.methods.exchanges import ARRAYS, PATIENCE, PROXIMAL_SHIFT, Problem, S
 from mbkit.model import Model
 from mbkit.model.changes.jumps import JumpLaw, Sliding, jump_bindings
 from mbkit.model.elements.kinds import EFFECTS
-from mbkit.model.parts import POSE_ROUNDING, RESTING
+from mbkit.model.parts import POSE_ROUNDING
 
 #: Mask of the velocities at rest.
 Mask = NDArray[np.bool_]
@@ -312,7 +312,8 @@ class Jumps(AddedForce):
             self._slid = model, sliding.at(none, none > 0, model)
         own = bare._of_model(self._slid[1], sliding.form)
         values = {name: np.where(still, 0.0, sides)[:, i] for i, name in sliding.sides.items()}
-        values |= {name: RESTING * still[:, i] for i, name in sliding.locks.items()}
+        locks = sliding.lock(sides, still)
+        values |= {name: locks[:, i] for i, name in sliding.locks.items()}
         own = own._with(own.model, {**own._batched, **values})
         own._state_unchecked = False
         return own._under(*dyn._acting) if dyn._acting[0] else own

@@ -105,9 +105,10 @@ class JumpLaw:
         may = nominal.bound != 0
         for binding in jump_bindings(model):
             may[model.layout.full_v[binding.part].start + binding.index[0]] = True
-        #: Velocities with friction, whatever parameters are, or with stops.
+        #: Velocities with friction, whatever parameters are; and those with friction or stops.
         self.stops = StopLaw(model)
-        self.which = np.flatnonzero((may @ sizes).astype(bool) | self.stops.which)
+        self.rubbing = np.flatnonzero(may @ sizes)
+        self.which = np.union1d(self.rubbing, np.flatnonzero(self.stops.which))
         #: That of a joint that has just let go, (nv,); its sign tells the side, and so it is zero nowhere else.
         self.just_moving: Array = np.where(
             (self.bound > 0) | self.stops.which, np.maximum(moving, np.finfo(float).tiny), 0.0
@@ -177,9 +178,9 @@ class Sliding:
     def __init__(self, model: Model) -> None:
         self.law = JumpLaw(model)
         self.names = model.velocity_names
-        #: Independent velocities with friction.
+        #: Independent velocities with friction or stops.
         self.which = self.law.which
-        self.sides = {int(i): f"friction side of {self.names[i]}" for i in self.which}
+        self.sides = {int(i): f"friction side of {self.names[i]}" for i in self.law.rubbing}
         self.locks = {int(i): f"friction lock of {self.names[i]}" for i in self.which}
         self.model = self._of(model)
         with unchecked():
@@ -192,11 +193,19 @@ class Sliding:
         """
         values: dict[str, Any] = dict(model.parameters)
         values |= {name: 0.0 if still[i] else float(sides[i]) for i, name in self.sides.items()}
-        values |= {name: RESTING * bool(still[i]) for i, name in self.locks.items()}
+        values |= {name: float(self.lock(sides, still)[i]) for i, name in self.locks.items()}
         with unchecked():
             out = replace(self.model._substituted(lambda p: Parameter(p.name, values[p.name])), time=model.time)
         vars(out)["form_digest"] = self.form
         return out
+
+    def lock(self, sides: Array, still: NDArray[np.bool_]) -> Array:
+        """Return the rotors that hold what rests, kg m² or kg, of the shape of v.
+
+        A joint at a stop without friction, that rests as the rows hold it, has none but a number that says so.
+        """
+        plain = ~np.isin(np.arange(len(self.names)), self.law.rubbing)
+        return np.where(still, RESTING, np.where(plain & (sides == 0), np.finfo(float).tiny, 0.0))
 
     def _of(self, model: Model) -> Model:
         layout, numbers = model.layout, JumpNumbers.of(model.joints)
@@ -208,12 +217,10 @@ class Sliding:
             joints.append(replace(joint, restitution=None, **smooth))
             # A joint that follows by a ratio of zero does not move.
             own_free = {(field, k): x for (name, field, k), x in free.items() if name == joint.name}
-            rows = [np.flatnonzero(layout.G[i])[0] for i in range(part.start, part.stop) if layout.G[i].any()]
-            # A joint with stops alone has a side too, by which its phase is told.
-            stops = not joint.mimic and self.law.stops.which[rows].any()
-            if not (own_free or numbers.bound[part].any() or stops) or not rows:
+            if not (own_free or numbers.bound[part].any()) or not layout.G[part].any():
                 continue
             name = f"friction of {joint.name}"
+            rows = [np.flatnonzero(layout.G[i])[0] for i in range(part.start, part.stop)]
             signs = [float(np.sign(layout.G[part.start + k, i])) for k, i in enumerate(rows)]
             own = [k for k, i in enumerate(rows) if int(i) in self.sides]
             force, expressions = _force(name, joint, JumpNumbers(*(x[part] for x in numbers)), signs, own_free)

@@ -365,7 +365,7 @@ class Phases:
         from mbkit.derivation.steps.moreau import phase_margin
 
         sliding, which = self._own.sliding, self.which.tolist()
-        sides, locks = ([of[i] for i in which] for of in (sliding.sides, sliding.locks))
+        sides, locks = [sliding.sides.get(i) for i in which], [sliding.locks[i] for i in which]
         return phase_margin(dyn.equations, which, sides, locks, self._stops)
 
     def holding(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> Array:
