@@ -730,6 +730,21 @@ def _energies(name: str) -> Example:
     )
 
 
+class _Resting(_Pendulum):
+    """It rests on a stop, into which all forces push it."""
+
+    def acceleration(self, *_: Any, **__: Any) -> np.ndarray:
+        return np.zeros(1)
+
+
+def _stopped(name: str) -> Example:
+    x = _energies(name)
+    c = _Resting(**{f.name: getattr(x.plain, f.name) for f in fields(Case) if f.init} | {"v": np.zeros(1)})
+    stops = {"stops": {"theta": (float(c.q[0]), None)}, "restitution": 0}
+    form = mb.lagrangian.Lagrangian(**x.model.form._arguments() | stops)
+    return replace(x, model=form.model, plain=c, words=(*x.words, "stops"))
+
+
 def _written(part: str) -> Callable[[str], Example]:
     """Return the maker of an example's equations on paper, which have the same motion."""
 
@@ -790,6 +805,7 @@ EXAMPLES: dict[str, Callable[[str], Example]] = {
     "written.row": _written("loop.distance"),
     "written.speed": _written("no_slip.blade"),
     "written.t": _written("force.of_time"),
+    "written.stop": _stopped,
     "gravity": lambda name: arm(name, gravity=True).built(("gravity",)),
     **{f"joint.{name}": with_joint(**x) for name, x in NUMBERS.items()},
     **{f"joint.{name}.several": with_joint(type_, **x) for name, (type_, x) in SEVERAL.items()},

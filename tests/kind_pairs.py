@@ -302,8 +302,8 @@ def reason(a: str, b: str) -> str:
 
 # The array
 
-#: Kinds of parts and joint types that stand beside others, and those of joints.
-NAMES = tuple(x for x in (*EXAMPLES, *TYPES) if x not in WRITTEN)
+#: Kinds of parts and joint types that stand beside others, and those of joints. No path runs stops on paper.
+NAMES = tuple(x for x in (*EXAMPLES, *TYPES) if x not in (*WRITTEN, "written.stop"))
 JOINT_KINDS = tuple(x for x in NAMES if base(x) in ON_A_JOINT or (x in TYPES and x != "joint_type.beam"))
 
 

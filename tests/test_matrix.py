@@ -115,7 +115,7 @@ def test_a_kind_acts_alone_and_is_taken_out(name: str) -> None:
     model = example(name)
     finer = name.rpartition(".")[0]
     also = {"force.of_time": "force.joint", "joint.limit.several": "joint.limit", "joint.stiction": "joint.friction"}
-    also |= dict.fromkeys(("written.row", "written.speed", "written.t"), "energies")
+    also |= dict.fromkeys(("written.row", "written.speed", "written.t", "written.stop"), "energies")
     wanted = {name, also.get(name, ""), finer} & {*PART_KINDS}
     # What holds a weight has one.
     weighs = {"gravity"} & {*model.acts}
@@ -128,7 +128,7 @@ def test_a_kind_acts_alone_and_is_taken_out(name: str) -> None:
         for feature in PART_KINDS[name].features:
             assert model.without(feature).digest == model.without(*wanted - {"mimic"}).digest
     else:
-        assert name in ("mimic", "energies", "written.row", "written.speed", "written.t")
+        assert name in ("mimic", "energies", "written.row", "written.speed", "written.t", "written.stop")
 
 
 @pytest.mark.parametrize("gate", sorted(registered()))

@@ -27,9 +27,10 @@ from mbkit.model.parts import Body, Frame, Joint
 
 
 def energies_latex(form: EnergyForm) -> str:
-    """Return T and V as inline LaTeX."""
+    """Return T, V and the stops as inline LaTeX."""
     board = ExpressionPrinter(form.coordinates, form.velocities, time=form.time)
-    return f"$T = {board.latex(form.T)},\\quad V = {board.latex(form.V)}$"
+    stops = "".join(rf",\quad {board.latex(g)} \ge 0" for g in form.stops)
+    return f"$T = {board.latex(form.T)},\\quad V = {board.latex(form.V)}{stops}$"
 
 
 # Bodies and joints of a model that has coordinates only
@@ -150,6 +151,7 @@ class EnergyModel(Model):
         parts = [s.T, s.V, s.dissipation, s.forces, s.constraints, s.coordinates, s.velocities, s.time]
         parts += [] if s.quasi is None else [s.quasi.D]
         parts += [s.velocity_constraints] if s.velocity_constraints else []
+        parts += [s.stops, s.restitution] if s.stops else []
         return "\n".join((s.name, *(sp.srepr(sp.sympify(x)) for x in parts)))
 
     def with_nominal(self, values: Mapping[str, Any]) -> EnergyModel:

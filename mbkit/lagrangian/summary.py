@@ -25,6 +25,7 @@ from mbkit._escape import identifier, one_line, python_docstring
 from mbkit._version import __version__
 from mbkit.errors import MbkitError
 from mbkit.lagrangian.energies.charts import chart_names
+from mbkit.lagrangian.energies.energy_form import ROWS
 from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, equations_of_motion, printed_equations
 from mbkit.lagrangian.printer import Abbreviations, ExpressionPrinter, folded, matrix, spread, written
 from mbkit.lagrangian.reduction.quasi_equations import QuasiEquationsOfMotion
@@ -307,12 +308,17 @@ class SystemSummary:
             out.append(f"Equation{'s' * (len(s.coordinates) > 1)} of motion:")
             for left, right in self._equations(self._short):
                 out += ["  " + line for line in folded(f"{left} = {right}", width - 2)]
+        out += ["  " + line for x in self._conditions() for line in folded(x, width - 2)]
         if self._kinematics:
             out += ["", "Kinematics:"]
             for row in self._kinematics:
                 out += ["  " + line for line in folded(f"{board.text(row.lhs)} = {board.text(row.rhs)}", width - 2)]
         out += ["", *self._conserved(width)]
         return "\n".join(out)
+
+    def _conditions(self, *, latex: bool = False) -> list[str]:
+        write = self._board.latex if latex else self._board.text
+        return self.equations.conditions(lambda x: write(self._short(x)), latex=latex)
 
     def _named(self, coordinate: sp.Symbol) -> str:
         text, own = written(coordinate.name), self._names.get(coordinate.name, coordinate.name)
@@ -352,6 +358,8 @@ class SystemSummary:
         out += [*([f"% {self._note}"] if self._note else []), _aligned(rows)]
         if not self.long:
             out.append(_aligned([f"{left} &= {right}" for left, right in self._equations(self._short, latex=True)]))
+        if s.stops:
+            out.append(_aligned([f"& {x}" for x in self._conditions(latex=True)]))
         if self._kinematics:
             out.append(_aligned([f"{board.latex(row.lhs)} &= {board.latex(row.rhs)}" for row in self._kinematics]))
         if self._kept:
@@ -385,11 +393,11 @@ class SystemSummary:
         out["gravity"] = [text(x) for x in e.potential_gradient]
         out["drift"] = [text(x) for x in e.drift]
         out["forces"] = [text(x) for x in e.forces]
-        out |= {n: [text(x) for x in getattr(s, n)] for n in ("constraints", "velocity_constraints")}
+        out |= {n: [text(x) for x in getattr(s, n)] for n in ROWS}
         # Each equation alone: no letter is explained elsewhere.
         rows = self._equations(Abbreviations((), ()), latex=True)
         out["equations"] = [] if self.long else [f"{text(x.lhs)} = {text(x.rhs)}" for x in e.equations()]
-        out["latex"] = [f"{left} = {right}" for left, right in rows]
+        out["latex"] = [*(f"{left} = {right}" for left, right in rows), *self._conditions(latex=True)]
         out["cyclic"] = [name(q) for q in s.cyclic_coordinates()]
         out["conserved"] = [{"name": n, "expression": text(x), "meaning": m} for n, x, m in self._kept]
         return out
@@ -414,7 +422,7 @@ def _aligned(rows: list[str]) -> str:
 
 # The equations as a Python module that needs NumPy only
 
-MODULE: Final = Path("python module", "a Python module cannot say of", ALL - {"row", "speed"})
+MODULE: Final = Path("python module", "a Python module cannot say of", ALL - {"row", "speed", "stop"})
 #: Names that the module itself uses, beside Python's own.
 _RESERVED: Final = {"np", "q", "v", "tau", "t", "M", "h", "out", "given", "unknown", "parameters", "PARAMETERS"}
 _FUNCTIONS: Final = {"mass_matrix", "nonlinear", "forward_dynamics"}
@@ -423,8 +431,8 @@ _FUNCTIONS: Final = {"mass_matrix", "nonlinear", "forward_dynamics"}
 def python_code(system: Lagrangian, note: str = "") -> str:
     """Return a module with `mass_matrix`, `nonlinear` and `forward_dynamics` of M(q) v̇ + h(q, v) = τ.
 
-    Its functions take one state, and parameters by keyword. Constraints are refused (UnsupportedError). `note` says
-    what the equations leave out.
+    Its functions take one state, and parameters by keyword. Constraints and stops are refused (UnsupportedError).
+    `note` says what the equations leave out.
     """
     MODULE.admit(system.model)
     e = system.equations()

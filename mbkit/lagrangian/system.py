@@ -15,7 +15,7 @@ from mbkit._check import Array, real, rows
 from mbkit._escape import one_line
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.constraint_manifold import Manifold, manifold_of, projected, require_independent
-from mbkit.errors import NumericalError
+from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.lagrangian.energies.energy_form import (
     EnergyForm,
     QuasiVelocities,
@@ -76,6 +76,10 @@ class Lagrangian(EnergyForm):
         Linear in the velocities: A(q, t) v + a(q, t) = 0 each, such as rolling (Neimark and Fufaev 1972, ch. I).
         They need not be integrable. T, V and forces are those of the free system: to put a row that is not
         integrable into T before Lagrange's equations are formed gives other, wrong equations.
+    stops : mapping of coordinate to (lower, upper), or sequence of sympy.Expr, optional
+        Bounds, None for no bound, or g(q, t) >= 0 each. They are written out; no engine runs them.
+    restitution : sympy.Expr or float, or sequence of one for each stop, optional
+        e of Newton's law of impact on the stops, from 0 to 1.
     name : str
         A name stands for one thing: ``Symbol("m", positive=True)`` and ``Symbol("m")`` are the same parameter.
 
@@ -83,14 +87,14 @@ class Lagrangian(EnergyForm):
     ----------
     T, V, dissipation, coordinates, velocities, accelerations, time, parameters
         The arguments in plain symbols; `time` is None where nothing depends on it.
-    constraints, velocity_constraints
-        The arguments in plain symbols.
+    constraints, velocity_constraints, stops, restitution
+        The arguments in plain symbols; of each stop g and e, and a coordinate's lower bound is before its upper one.
     forces : (n, 1) sympy.Matrix
         Without the dissipation.
     inputs : mapping of coordinate to sympy.Symbol
         The symbols that stand for ``tau``.
-    multiplier_symbols : tuple of sympy.Symbol
-        λ of each constraint, those of the velocity constraints last.
+    multiplier_symbols, stop_multipliers : tuple of sympy.Symbol
+        λ of each constraint, those of the velocity constraints last, and λ of each stop.
 
     Raises
     ------
@@ -113,7 +117,17 @@ class Lagrangian(EnergyForm):
     @property
     def _in_rates(self) -> Lagrangian:
         """The system in its coordinates' rates."""
-        return self
+        return getattr(self, "system", self)
+
+    @property
+    def _without_stops(self) -> Lagrangian:
+        """The same, for forms of the equations that do not hold stops."""
+        if self.stops:
+            raise UnsupportedError(
+                f"{self.name}: has stops, such as {self.stops[0]} >= 0, whose forces and impacts this form of the "
+                "equations does not hold; equations() and impulse(stop=...) have them"
+            )
+        return self._in_rates
 
     @property
     def _given(self) -> Lagrangian:
@@ -162,7 +176,7 @@ class Lagrangian(EnergyForm):
         InputError
             One is not cyclic or a force acts along it; none is, or none would remain.
         """
-        return routhian(self._in_rates, cyclic)
+        return routhian(self._without_stops, cyclic)
 
     def hamiltonian(self) -> Hamiltonian:
         """Return Hamilton's function H(q, p, t) with its canonical equations.
@@ -170,9 +184,9 @@ class Lagrangian(EnergyForm):
         Raises
         ------
         UnsupportedError
-            Constraints act on the system.
+            Constraints or stops act on the system.
         """
-        return self._in_rates._hamiltonian
+        return self._without_stops._hamiltonian
 
     @cached_property
     def _hamiltonian(self) -> Hamiltonian:
@@ -232,17 +246,17 @@ class Lagrangian(EnergyForm):
         InputError
             Too many or too few, or some that do not determine every velocity with the constraints.
         UnsupportedError
-            No constraints.
+            No constraints, or stops beside them.
         """
-        return nonholonomic_equations(self._in_rates, quasi_velocities, "Maggi")
+        return nonholonomic_equations(self._without_stops, quasi_velocities, "Maggi")
 
     def boltzmann_hamel(self, quasi_velocities: Any = None) -> NonholonomicEquations:
         """Return the same equations by Boltzmann and Hamel, from T in n quasi-velocities; arguments as of `maggi`."""
-        return nonholonomic_equations(self._in_rates, quasi_velocities, "Hamel")
+        return nonholonomic_equations(self._without_stops, quasi_velocities, "Hamel")
 
     def appell(self, quasi_velocities: Any = None) -> NonholonomicEquations:
         """Return the same equations by Gibbs and Appell, with `S`; arguments as of `maggi`."""
-        return nonholonomic_equations(self._in_rates, quasi_velocities, "Appell")
+        return nonholonomic_equations(self._without_stops, quasi_velocities, "Appell")
 
     def integrability(self) -> Integrability:
         """Return which velocity constraints are integrable, by Frobenius' theorem.
@@ -257,7 +271,7 @@ class Lagrangian(EnergyForm):
     # Impacts
 
     def impulse(
-        self, impulses: Mapping[Any, Any] | None = None, *, rows: Any = (), restitution: Any = 0
+        self, impulses: Mapping[Any, Any] | None = None, *, rows: Any = (), restitution: Any = 0, stop: Any = None
     ) -> ImpulseEquations:
         """Return the equations of an impact, which changes velocities at once: M (v⁺ - v⁻) = Ŝ + Jᵀ P.
 
@@ -269,12 +283,19 @@ class Lagrangian(EnergyForm):
             Linear in the velocities: a constraint that is imposed at once, or the approach of a contact.
         restitution : sympy.Expr or float
             e of Newton's law for `rows`: they are -e times what they were before.
+        stop : int, optional
+            Place in `stops` of the one that is hit: ġ is the row, with its own e. All others take no part.
 
         Raises
         ------
         InputError
-            Neither impulses nor rows, rows that are not linear, e beyond 0 to 1.
+            Neither impulses nor rows, rows that are not linear, e beyond 0 to 1, or no such stop.
         """
+        if stop is not None:
+            if stop not in range(len(self.stops)) or rows != () or restitution != 0:
+                here = f"one of {len(self.stops)} stops, counted from 0, without rows and restitution"
+                raise InputError(f"stop: expected {here}, got {stop!r}")
+            rows, restitution = [self._in_rates.equations().stops[stop].rate], self.restitution[stop]
         return impulse_equations(self._in_rates, impulses, rows, restitution)
 
     # Running it
@@ -408,7 +429,7 @@ class QuasiLagrangian(Lagrangian):
         self.__dict__["system"] = system
         # The parts of T are known, and need not be separated again.
         arguments, self.__dict__["kinetic"], self.quasi = in_quasi_velocities(system, D, names, drift)
-        super().__init__(**arguments)
+        super().__init__(**arguments, stops=system.stops, restitution=system.restitution)
         self.time = self.time or self.quasi.time
 
     quasi: QuasiVelocities
@@ -475,10 +496,6 @@ class QuasiLagrangian(Lagrangian):
         return QuasiLagrangian(self.system, D, names, drift)
 
     # Reductions in coordinates' rates
-
-    @property
-    def _in_rates(self) -> Lagrangian:
-        return self.system
 
     @property
     def _given(self) -> Lagrangian:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import numpy as np
 import sympy as sp
@@ -28,6 +28,9 @@ from mbkit.lagrangian.energies.symbols import (
     undefined,
 )
 from mbkit.lagrangian.trig.simplify import gradient, is_zero, settled, tidy, tidy_matrix
+
+#: Arguments that are several expressions each.
+ROWS: Final = ("constraints", "velocity_constraints", "stops", "restitution")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +98,8 @@ class EnergyForm:
         parameters: Mapping[sp.Symbol, float | None] | Iterable[sp.Symbol] | None = None,
         constraints: Sequence[Any] = (),
         velocity_constraints: Sequence[Any] = (),
+        stops: Any = (),
+        restitution: Any = 0,
         name: str = "system on paper",
     ) -> None:
         self.parameters = _parameters(parameters)
@@ -104,8 +109,11 @@ class EnergyForm:
         acting = _forces(into, forces or {})
         self.constraints = _rows(into, "constraints", constraints)
         self.velocity_constraints = _rows(into, "velocity_constraints", velocity_constraints)
+        values = {s: x for s, x in self.parameters.items() if x is not None}
+        self.stops, self.restitution = _stops(into, stops, restitution, values)
         self.coordinates, self.velocities, self.clock = into.coordinates, into.velocities, into.time
         others = (self.T, self.V, self.dissipation, *self.constraints, *self.velocity_constraints)
+        others = (*others, *self.stops, *self.restitution)
         # The time of dynamicsymbols need not enter by itself.
         self.time = into.time if any(into.time in x.free_symbols for x in (*others, *acting.values())) else None
         moving = {*self.coordinates, *self.velocities, *([self.time] if self.time else [])}
@@ -113,10 +121,9 @@ class EnergyForm:
         self.forces = sp.ImmutableMatrix([x if q not in self.inputs else 0 for q, x in acting.items()])
         self.accelerations = accelerations_of(self.coordinates, self.velocities)
         used = {s.name for s in (*moving, *self.parameters, *self.inputs.values(), *self.accelerations)}
-        self.multiplier_symbols = tuple(
-            sp.Symbol(free_name(f"lambda{k + 1}", used))
-            for k in range(len(self.constraints) + len(self.velocity_constraints))
-        )
+        m = len(self.constraints) + len(self.velocity_constraints)
+        symbols = tuple(sp.Symbol(free_name(f"lambda{k + 1}", used)) for k in range(m + len(self.stops)))
+        self.multiplier_symbols, self.stop_multipliers = symbols[:m], symbols[m:]
         _check_names(self)
         _check_declared(self)
         _check_velocities(self)
@@ -212,7 +219,7 @@ class EnergyForm:
 
     def _arguments(self) -> dict[str, Any]:
         energies = ("T", "V", "coordinates", "velocities", "dissipation", "name")
-        names = (*energies, "constraints", "velocity_constraints")
+        names = (*energies, *ROWS)
         forces = {q: self.inputs.get(q, x) for q, x in zip(self.coordinates, self.forces, strict=True)}
         others = {"time": self.clock, "forces": forces, "parameters": dict(self.parameters)}
         return {n: getattr(self, n) for n in names} | others
@@ -242,7 +249,7 @@ class EnergyForm:
         out = self._arguments()
         out |= {name: replaced(out[name]) for name in ("T", "V", "dissipation")}
         out["forces"] = {q: x if q in self.inputs else replaced(x) for q, x in out["forces"].items()}
-        out |= {name: [replaced(c) for c in out[name]] for name in ("constraints", "velocity_constraints")}
+        out |= {name: [replaced(c) for c in out[name]] for name in ROWS}
         out["parameters"] = {s: x for s, x in self.parameters.items() if s not in numbers}
         return self._like(out)
 
@@ -277,9 +284,12 @@ def vanish(parts: Iterable[sp.Expr]) -> bool:
 
 
 def acting_forces(form: EnergyForm) -> list[sp.Expr]:
-    """Return the generalized forces beside V's: forces, inputs and dissipation, one a coordinate."""
+    """Return the generalized forces beside V's: forces, inputs, dissipation and stops with their λ, one a velocity."""
+    pairs = zip(form.stops, form.stop_multipliers, strict=True)
+    pushed = sp.Matrix(gradient(sum((g * x for g, x in pairs), sp.Integer(0)), form.coordinates))
+    pushed = pushed if form.quasi is None else form.quasi.D.T * pushed
     # Not from the equations of motion, whose Christoffel symbols are long.
-    named = zip(form.coordinates, gradient(form.dissipation, form.velocities), form.forces, strict=True)
+    named = zip(form.coordinates, gradient(form.dissipation, form.velocities), form.forces + pushed, strict=True)
     return [tidy(x + form.inputs.get(q, sp.Integer(0)) - loss) for q, loss, x in named]
 
 
@@ -389,9 +399,35 @@ def _rows(into: PlainSymbols, what: str, source: Any) -> tuple[sp.Expr, ...]:
         source = [source]
     if isinstance(source, (Mapping, set, frozenset)) or not isinstance(source, Iterable):
         raise InputError(f"{what}: expected a list of expressions, got {source!r}")
-    # An equation stands for its left side less its right side.
-    sides = [(c.lhs, c.rhs) if isinstance(c, sp.Equality) else (c, 0) for c in source]
+    # An equation stands for its left side less its right side, an inequality for the greater one less the other.
+    kind, *ends = ((sp.Ge, sp.Le), "gts", "lts") if what == "stops" else (sp.Equality, "lhs", "rhs")
+    sides = [[getattr(c, x) for x in ends] if isinstance(c, kind) else (c, 0) for c in source]
     return tuple(into(f"{what}[{k}]", a) - into(f"{what}[{k}]", b) for k, (a, b) in enumerate(sides))
+
+
+def _stops(into: PlainSymbols, source: Any, restitution: Any, values: Any) -> tuple[tuple[sp.Expr, ...], ...]:
+    """Return g and e of each stop; `values` are those of parameters."""
+    gaps = list[Any]()
+    for key, bounds in source.items() if isinstance(source, Mapping) else ():
+        q, pair = into("stops", key), [*bounds] if isinstance(bounds, (tuple, list, sp.Tuple)) else []
+        if q not in into.coordinates:
+            names = ", ".join(map(str, into.coordinates))
+            raise InputError(f"stops: {key} is no coordinate; the coordinates are {names}, and stops=[g] takes g >= 0")
+        if len(pair) != 2 or pair.count(None) == 2:
+            raise InputError(f"stops[{key}]: expected (lower, upper), one of which may be None, got {bounds!r}")
+        both = [sign * (q - into(f"stops[{key}]", x)) for sign, x in zip((1, -1), pair, strict=True) if x is not None]
+        if len(both) == 2 and (both[0] + both[1]).subs(values).is_nonpositive:
+            raise InputError(f"stops[{key}]: expected lower < upper, got {bounds!r}; exchange them")
+        gaps += both
+    gaps = [*_rows(into, "stops", gaps if isinstance(source, Mapping) else source)]
+    several = isinstance(restitution, (tuple, list, sp.Tuple))
+    given = [*restitution] if several else [restitution] * (len(gaps) or restitution != 0)
+    if len(given) != len(gaps):
+        raise InputError(f"restitution: expected one e, or one for each of {len(gaps)} stops, got {restitution!r}")
+    for e in (out := tuple(into("restitution", x) for x in given)):
+        if (at := e.subs(values)).is_number and not 0 <= at <= 1:
+            raise InputError(f"restitution: expected a number from 0 to 1, got {at}; 1 loses no energy")
+    return tuple(gaps), out
 
 
 def _inputs(
@@ -407,8 +443,7 @@ def _parts(d: EnergyForm) -> dict[str, sp.Expr]:
     """Return every expression by its name in messages."""
     out = {"T": d.T, "V": d.V, "dissipation": d.dissipation}
     out |= {f"forces[{q}]": x for q, x in zip(d.coordinates, d.forces, strict=True)}
-    out |= {f"constraints[{k}]": x for k, x in enumerate(d.constraints)}
-    return out | {f"velocity_constraints[{k}]": x for k, x in enumerate(d.velocity_constraints)}
+    return out | {f"{name}[{k}]": x for name in ROWS for k, x in enumerate(getattr(d, name))}
 
 
 def _check_names(d: EnergyForm) -> None:
@@ -467,16 +502,17 @@ def _check_velocities(d: EnergyForm) -> None:
         raise InputError(f"T: {unknown[0]} is a function of a velocity; T is of second degree in the velocities")
     for name, x in _parts(d).items():
         rates = x.free_symbols & moving
-        if rates and name.startswith("constraints"):
+        if rates and name.startswith(("constraints", "stops")):
             raise InputError(f"{name}: expected coordinates, time and parameters only, got the velocity {plain(rates)}")
+        if name.startswith(("constraints", "stops")) and not x.free_symbols & set(d.coordinates):
+            raise InputError(f"{name}: {x} holds no coordinate, so that it binds none")
+        if name.startswith("restitution") and not x.free_symbols <= {*d.parameters}:
+            raise InputError(f"{name}: expected a number or parameters only, got {x}")
     if d.dissipation != 0 and not d.dissipation.free_symbols & moving:
         raise InputError(
             f"dissipation: {d.dissipation} holds none of the velocities {', '.join(map(str, d.velocities))}, and its "
             "force is what it gains by them; a potential energy belongs in V"
         )
-    for k, x in enumerate(d.constraints):
-        if not x.free_symbols & set(d.coordinates):
-            raise InputError(f"constraints[{k}]: {x} holds no coordinate, so that it binds none")
     for k, x in enumerate(d.velocity_constraints):
         slopes = [sp.diff(x, w) for w in d.velocities]
         if not any(slopes):

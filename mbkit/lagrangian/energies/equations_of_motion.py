@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations_with_replacement
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import sympy as sp
 from sympy.matrices.exceptions import NonInvertibleMatrixError
@@ -17,6 +17,27 @@ from mbkit.lagrangian.energies.energy_form import EnergyForm
 from mbkit.lagrangian.printer import Abbreviations, ExpressionPrinter, Printable, aligned, spread
 from mbkit.lagrangian.trig.shortest_form import complexity
 from mbkit.lagrangian.trig.simplify import gradient, slope, tidy, tidy_matrix
+
+#: A stop's conditions (Signorini; Newton's law of impact): always, where it is touched, and where it is hit.
+_CONDITIONS: Final = (
+    "0 ≤ {gap} ⟂ {force} ≥ 0",
+    "in contact, ġ = 0: 0 ≤ {acceleration} ⟂ {force} ≥ 0",
+    "in contact, ġ = {rate} < 0: ġ⁺ = {rebound}, M (v⁺ - v⁻) = Jᵀ Λ{others}, J = [{J}], Λ{alone} ≥ 0",
+)
+_IN_LATEX: Final = {"in contact": r"\text{in contact}", ", ": r",\ ", ": ": r":\ ", "⁻¹": "^{-1}"} | dict(
+    zip("≤≥⟂ġ⁺⁻ᵀΛ", (r"\le", r"\ge", r"\perp", r"\dot{g}", "^{+}", "^{-}", "^{T}", r"\Lambda"), strict=True)
+)
+
+
+class Stop(NamedTuple):
+    """A one-sided condition g >= 0 of a system: g, ġ and g̈, J = ∂ġ/∂v, λ of its force Jᵀ λ, and e of impacts on it."""
+
+    gap: sp.Expr
+    rate: sp.Expr
+    acceleration: sp.Expr
+    jacobian: sp.ImmutableMatrix
+    multiplier: sp.Symbol
+    restitution: sp.Expr
 
 
 @dataclass(frozen=True, repr=False)
@@ -37,6 +58,8 @@ class EquationsOfMotion(Printable):
     constraint_acceleration, constraints : (m, 1) sympy.Matrix
         γ, the terms of J̇ v and of the time, so that J v̇ + γ = 0; and f(q, t), then A v + a of the velocity
         constraints, which are zero.
+    stops : tuple of Stop
+        Their forces are on the right side as well; `conditions` has what is no equation.
     """
 
     coordinates: tuple[sp.Symbol, ...]
@@ -51,6 +74,7 @@ class EquationsOfMotion(Printable):
     constraint_acceleration: sp.ImmutableMatrix = field(default_factory=lambda: sp.ImmutableMatrix(0, 1, []))
     constraints: sp.ImmutableMatrix = field(default_factory=lambda: sp.ImmutableMatrix(0, 1, []))
     multipliers: tuple[sp.Symbol, ...] = ()
+    stops: tuple[Stop, ...] = ()
 
     @cached_property
     def coriolis_force(self) -> sp.ImmutableMatrix:
@@ -78,7 +102,8 @@ class EquationsOfMotion(Printable):
     def _right_side(self) -> sp.ImmutableMatrix:
         """Q (+ Jᵀ λ), (n, 1)."""
         J, multipliers = self.constraint_jacobian, self.multipliers
-        return self.forces + J.T * sp.Matrix(multipliers) if multipliers else self.forces
+        out = self.forces + J.T * sp.Matrix(multipliers) if multipliers else self.forces
+        return sum((stop.jacobian.T * stop.multiplier for stop in self.stops), out)
 
     def _rows(self) -> list[tuple[list[sp.Expr], sp.Expr]]:
         """Return the terms of each left side in the order of textbooks, and its right side."""
@@ -117,6 +142,23 @@ class EquationsOfMotion(Printable):
             ) from None
         return tuple(sp.Eq(a, shorter(x), evaluate=False) for a, x in zip(self.accelerations, solved, strict=True))
 
+    def conditions(self, write: Callable[[Any], str] = str, *, latex: bool = False) -> list[str]:
+        """Return three conditions of each stop, with expressions as `write` has them; Λ is that of one hit alone."""
+
+        def times(x: sp.Expr) -> str:
+            return "-" if x == 1 else f"-({write(x)}) " if x.is_Add else f"-{write(x)} "
+
+        out, others, alone = list[str](), " + Aᵀ P" if self.multipliers else "", not self.multipliers
+        for s in self.stops:
+            parts = {"gap": s.gap, "rate": s.rate, "acceleration": s.acceleration, "force": s.multiplier}
+            texts = {name: write(x) for name, x in parts.items()} | {"J": ", ".join(write(x) for x in s.jacobian)}
+            texts["rebound"] = f"{times(s.restitution)}ġ⁻" if not s.restitution.is_zero else "0"
+            texts["alone"] = f" = {times(1 + s.restitution)}ġ⁻/(J M⁻¹ Jᵀ)" if alone else ""
+            out += [x.format(**texts, others=others) for x in _CONDITIONS]
+        for sign, command in _IN_LATEX.items() if latex else ():
+            out = [line.replace(sign, command) for line in out]
+        return out
+
     def latex(self, *, apart: bool = False) -> str:
         """Return the equations as an aligned LaTeX block, in the order of textbooks.
 
@@ -131,10 +173,13 @@ class EquationsOfMotion(Printable):
         short = Abbreviations(shown, set().union(*(x.free_symbols for x in shown)))
         pairs = printed_equations(self, board, short, latex=True, apart=apart)
         pairs += [(board.latex(letter), board.latex(root)) for letter, root in short.roots.items()]
-        return aligned(pairs)
+        lines = [aligned(pairs), *self.conditions(board.latex, latex=True)]
+        whole = r" \\ ".join(lines)
+        return rf"\begin{{gathered}}{whole}\end{{gathered}}" if self.stops else whole
 
     def __str__(self) -> str:
-        return terminal("\n".join(f"{_joined(terms, str)} = {force}" for terms, force in self._rows()))
+        lines = [f"{_joined(terms, str)} = {force}" for terms, force in self._rows()]
+        return terminal("\n".join([*lines, *self.conditions()]))
 
 
 def _joined(terms: list[sp.Expr], printed: Callable[[sp.Expr], str]) -> str:
@@ -213,14 +258,23 @@ def equations_of_motion(system: EnergyForm, *, coriolis: bool = True) -> Equatio
 
 def constraint_fields(system: EnergyForm, qdot: sp.Matrix) -> dict[str, Any]:
     """Return the fields of `EquationsOfMotion` that constraints fill, with the coordinates' rates in velocities."""
-    m, t = len(system.multiplier_symbols), system.time
-    rate = system.constraint_matrix * sp.Matrix(system.velocities) + system.constraint_drift
-    gamma = rate.jacobian(system.coordinates) * qdot if m else rate
+    m, t, v = len(system.multiplier_symbols), system.time, sp.Matrix(system.velocities)
+
+    def along(x: sp.Matrix) -> sp.Matrix:
+        return x.jacobian(system.coordinates) * qdot + (0 * x if t is None else sp.diff(x, t))
+
+    def stop(g: sp.Expr, *others: Any) -> Stop:
+        rate = tidy_matrix(along(sp.Matrix([g])))
+        J = tidy_matrix(rate.jacobian(v))
+        return Stop(g, rate[0], tidy((J * sp.Matrix(system.accelerations) + along(rate))[0]), J, *others)
+
+    rate = system.constraint_matrix * v + system.constraint_drift
     return {
         "constraint_jacobian": system.constraint_matrix,
-        "constraint_acceleration": tidy_matrix(gamma if t is None or not m else gamma + sp.diff(rate, t)),
+        "constraint_acceleration": tidy_matrix(along(rate) if m else rate),
         "constraints": sp.ImmutableMatrix(m, 1, [*system.constraints, *system.velocity_constraints]),
         "multipliers": system.multiplier_symbols,
+        "stops": tuple(map(stop, system.stops, system.stop_multipliers, system.restitution)),
     }
 
 

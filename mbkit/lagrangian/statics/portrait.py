@@ -34,7 +34,7 @@ def portrait(
     Parameters
     ----------
     system : Lagrangian or Routhian
-        With one coordinate, or one that is left; without time and constraints.
+        With one coordinate, or one that is left; without time, constraints and stops.
     q, v : (2,) array_like
         From and to which coordinate and velocity.
     ax : matplotlib.axes.Axes, optional
@@ -45,16 +45,17 @@ def portrait(
     Raises
     ------
     UnsupportedError
-        More coordinates, a system that depends on the time, or constraints.
+        More coordinates, a system that depends on the time, constraints or stops.
     InputError
         Bounds that are none, or a parameter without a value.
     """
     form = system.lagrangian if isinstance(system, Routhian) else system
     if not isinstance(form, Lagrangian):
         raise InputError(f"system: expected a Lagrangian or a Routhian, got {type(system).__name__}")
-    if len(form.coordinates) != 1 or form.time is not None or form.multiplier_symbols or form.quasi is not None:
+    bound = form.multiplier_symbols or form.stops
+    if len(form.coordinates) != 1 or form.time is not None or bound or form.quasi is not None:
         raise UnsupportedError(
-            f"portrait: expected one coordinate without time and constraints, got {form.name} of "
+            f"portrait: expected one coordinate without time, constraints and stops, got {form.name} of "
             f"{', '.join(map(str, form.coordinates))}; Lagrangian.routhian leaves out cyclic coordinates"
         )
     bounds = [finite_array(name, x, (2,)) for name, x in (("q", q), ("v", v))]
