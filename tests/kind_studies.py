@@ -72,6 +72,7 @@ from tests.kind_paths import (
     engine,
     flow,
     kept,
+    lacks_stops,
     more_inputs,
     named,
     off,
@@ -320,7 +321,7 @@ def _read_program(x: Example, folder: Path) -> Told:
     for lines in (lines_of_text(str(text)), lines_of_latex(text.latex())):
         out = assigned(lines, values)
         worst = max(worst, off([y for n, y in out.items() if n.startswith("forward")], x.accelerated()))
-    return worst
+    return worst, lacks_stops(x, str(text))
 
 
 @column("texts", "program text in C", "program")
@@ -364,8 +365,9 @@ def _read_equations(x: Example, folder: Path) -> Told:
     e, c = lag.equations(), x.plain
     a = x.acceleration(x.t, c.q, c.v, 0 * x.tau)
     coordinates = c.q if len(e.coordinates) == c.n else x.q
-    symbols = (*e.coordinates, *e.velocities, *e.accelerations, *e.multipliers, *([lag.time] if lag.time else []))
-    given = [*coordinates, *x.v, *a, *(0.0 for _ in e.multipliers), *([x.t] if lag.time else [])]
+    forces = (*e.multipliers, *lag.stop_multipliers)
+    symbols = (*e.coordinates, *e.velocities, *e.accelerations, *forces, *([lag.time] if lag.time else []))
+    given = [*coordinates, *x.v, *a, *(0.0 for _ in forces), *([x.t] if lag.time else [])]
     if len(given) != len(symbols):
         raise AssertionError(f"{symbols}")
     values = {plain(str(s)): float(y) for s, y in zip(symbols, given, strict=True)}
@@ -382,9 +384,9 @@ def _read_equations(x: Example, folder: Path) -> Told:
             here = known | more
             return np.array([number(left, here) - number(right, here) for left, _, right in rows])
 
-        r, forces = rest({}), [plain(str(s)) for s in e.multipliers]
+        r = rest({})
         if forces:
-            columns = np.stack([rest({s: 1.0}) - r for s in forces], axis=1)
+            columns = np.stack([rest({plain(str(s)): 1.0}) - r for s in forces], axis=1)
             r = r - columns @ np.linalg.lstsq(columns, r, rcond=None)[0]
         worst = max(worst, float(np.abs(r).max()))
     return worst

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, count, finite_array, is_on_device, on_host, real
 from mbkit.codegen.backend import DERIVING, Machine, compile_by_default, executable, has_compiler
+from mbkit.codegen.c_source import HIT
 from mbkit.derivation import ELIMINATIONS, Elimination, Equations, elimination_of, equations_of
 from mbkit.derivation.body_motion import BODY_QUANTITIES
 from mbkit.derivation.least_constraint import has_squares
@@ -22,7 +23,15 @@ from mbkit.engines.elements.passive import UNDER_FORCE
 from mbkit.engines.frames_and_momenta import ALIGNED
 from mbkit.engines.loads import Wrenches
 from mbkit.engines.steps import momentum_step_slopes
-from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError, require_known
+from mbkit.errors import (
+    InputError,
+    MbkitWarning,
+    NumericalError,
+    UnknownNameError,
+    UnsupportedError,
+    require_known,
+    warn,
+)
 from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method
 from mbkit.model import Frame, Model
 from mbkit.model.elements.kinds import that_do
@@ -554,6 +563,8 @@ class LagrangianDynamics(Derived):
     def _function(self, name: str, frame: str | None, axes: str, kind: str) -> Any:
         f = self.equations.function(name, frame, axes, kind)
         given = f.sx_in()
+        if "stop" in self.model.effects and "tau" in f.name_in():
+            warn(f"{self.model.name}: {name}: {HIT}", MbkitWarning)
         # Users inline and differentiate it: small is worth a search.
         return ca.Function(name, given, f.call(given), f.name_in(), f.name_out(), {"cse": True})
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from fractions import Fraction
 from itertools import chain, count
 from typing import Final, cast
 
@@ -17,6 +18,7 @@ from mbkit.lagrangian.energies.charts import chart_names, chart_velocities
 from mbkit.lagrangian.energy_model import EnergyModel
 from mbkit.lagrangian.summary import in_symbols
 from mbkit.lagrangian.system import Lagrangian, QuasiLagrangian
+from mbkit.lagrangian.trig.shortest_form import number
 from mbkit.lagrangian.trig.simplify import tidy
 from mbkit.model import Joint, Model
 from mbkit.model.changes.jumps import held_at_rest, jump_rates
@@ -24,6 +26,7 @@ from mbkit.model.elements.beams import BeamEnd
 from mbkit.model.elements.motion_laws import MOTION_LAWS, motions_of
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.elements.references import _OF_BODIES, KINDS_OF_PARTS, names_in
+from mbkit.model.stops import StopLaw
 
 #: Velocities up to which equations are written out: of a tree; with loops or motions in time, as a row of 40 four-bars
 #: has 81; and of what rolls, as a bicycle's nine take half a minute and rows that nobody reads.
@@ -42,8 +45,8 @@ def from_model(
 
     The joints' formulas are evaluated on exact sums of cosines and sines. Numbers are the decimals of the description.
     Springs are in V, dampers in the dissipation, rotors in T. A force that jumps is -f sign(v), which is zero at rest,
-    where that of the engines holds up to its bound; limits are data, as in every engine. Forces of functions at
-    joints are written out, their potentials in V.
+    where that of the engines holds up to its bound. Limits are data, and those that act are stops on paper as well.
+    Forces of functions at joints are written out, their potentials in V.
 
     Loop closures become holonomic constraints, in the order of `model.loops`, in the axes of the body that carries
     both ends, with the rows of `Dynamics.constraint_names`. A point closure has three, two in a plane, and its
@@ -147,6 +150,11 @@ def from_model(
         pushed = [x - size * sp.sign(rate) * sp.diff(rate, w) for x, w in zip(pushed, v, strict=True)]
     T, V, R, *constraints = (x.xreplace(put) for x in (T, V + stored, R, *(row for _, row in rows)))
     pushed, moving = ([x.xreplace(put) for x in found] for found in (pushed, moving))
+    ends = StopLaw(model)
+    where = sorted(ends.names, key=lambda at: at[::-1])
+    bounds, rebounds = ([number(Fraction(repr(float(x[at])))) for at in where] for x in (ends.bounds, ends.restitution))
+    if held := [ends.names[at][0] for at in where if at[1] in moved]:
+        raise UnsupportedError(f"{model.name}: joint {held[0]!r} with stops is moved in time; drives=True keeps both")
     independent = [i for i in range(len(q)) if i not in moved]
     # Dampers on prescribed joints alone act on no coordinate that is left.
     R = R if R.free_symbols & {v[i] for i in independent} else sp.Integer(0)
@@ -162,6 +170,8 @@ def from_model(
         "dissipation": R,
         "constraints": constraints,
         "velocity_constraints": moving,
+        "stops": [(1 - 2 * side) * (q[i] - x) for (side, i), x in zip(where, bounds, strict=True)],
+        "restitution": rebounds,
         # A number that only a frame needs is no part of the equation; a name of the user's own stays all the same.
         "parameters": {s: source.parameters[n] for n, s in parameters.items() if named is None or s in used} | g,
         "name": model.name,

@@ -55,7 +55,7 @@ class ProgramText(Printable):
     results : sympy.Matrix
         The quantity, in named terms.
     note : str
-        What holds joints at rest in no term, and where constraints hold; empty without both.
+        What holds joints at rest, or at stops, in no term, and where constraints hold; empty without all of these.
     """
 
     model: str
@@ -187,7 +187,7 @@ def program(model: Model, quantity: str = "inverse_dynamics") -> ProgramText:
         known.append(x)
     (shape,), (out,) = operations.shapes, operations.outputs
     results = sp.ImmutableMatrix(*shape, lambda i, j: known[int(out[i, j])])
-    jumps = model.acts.keys() & {*that_do("jump")}
+    jumps = model.acts.keys() & {*that_do("jump")} - {*that_do("stop")}
     if jumps and all(o.name != "sign" for o in operations.operations):
         notes = PROGRAM.admit(model.without(*jumps))
     return ProgramText(model.name, quantity, operations.arithmetic, inputs, tuple(terms), results, "; ".join(notes))

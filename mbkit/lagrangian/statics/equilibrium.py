@@ -57,7 +57,7 @@ def _driven(model: Model) -> Iterator[str]:
 EQUILIBRIUM: Final = Path(
     "equilibrium",
     "equilibrium: not known of",
-    ALL,
+    ALL - {"stop"},
     notes={"jump": f"{EFFECTS['jump']}, which holds a range of configurations, is left out"},
     also=_driven,
 )
