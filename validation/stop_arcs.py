@@ -20,6 +20,8 @@ DIGITS = 40
 ORDER = 48
 #: A coefficient below is zero: a gap that has just opened has leading ones of rounding alone.
 ZERO = mp.mpf(10) ** -28
+#: Velocity behind a hit from which no more bounces are followed: all that are left take as long, and less.
+REST = mp.mpf(10) ** -20
 #: Places within a step at which signs are looked at.
 PLACES = 32
 
@@ -141,7 +143,10 @@ def sliders(m: Sequence[Any], g: Any = 0, push: Any = None) -> Callable[..., Any
 
 
 class Event(NamedTuple):
-    """`kind` is hits, leaves (a stop), stops or lets go (by friction); side -1 is the lower stop, or a way."""
+    """`kind` is hits, rests or leaves, of a stop, and stops, turns or lets go, of friction.
+
+    `side` is -1 for the lower stop, 1 for the upper, and for friction the way.
+    """
 
     t: Any
     kind: str
@@ -304,24 +309,37 @@ def _run(terms: Any, q: Any, v: Any, stops: Any, duration: Any, friction: Any, m
         for j in n:
             if not sides[j]:
                 v[j] = mp.mpf(0)
-        before, lost, others = list(v), mp.mpf(0), list[tuple[int, int]]()
+        before, lost, hit, slid = list(v), mp.mpf(0), [(kind, i, side)], list(sides)
         if kind == "hits":
             # What arrives at the same time takes part in the same impact.
             for j in n:
                 for way, bound in ((-1, stops[j].lower), (1, stops[j].upper)):
                     if bound is not None and abs(q[j] - bound) < ZERO:
                         q[j] = mp.mpf(bound)
-                        others += [(j, way)] if j != i and way * v[j] > 0 else []
+                        hit += [(kind, j, way)] if j != i and way * v[j] > 0 else []
             M, _ = terms(q, v, t)
             v = impact(M, v, [stops[j].reached(q[j]) for j in n], [stops[j].e for j in n])
+            if stops[i].e and abs(v[i]) < REST:
+                hit, v[i] = [("rests", i, side)], mp.mpf(0)
             lost = energy_of_motion(M, before) - energy_of_motion(M, v)
             sides = pattern()
         elif kind == "stops":
             v[i] = mp.mpf(0)
             sides = pattern()
+            hit = [("turns" if sides[i] else "stops", i, side)]
         else:
             on = stops[i].reached(q[i])
-            kind, side = ("leaves", on) if on else ("lets go", side)
+            hit = [("leaves", i, on) if on else ("lets go", i, side)]
             sides[i] = -on or side
-        events += [Event(t, kind, j, way, q, before, v, lost) for j, way in [(i, side), *others]]
+        own = {j for _, j, _ in hit}
+        for j in (j for j in n if j not in own):
+            # An impact, or what has stopped, sets others free or brings them to rest.
+            on, turned = stops[j].reached(q[j]), friction[j] and slid[j] * sides[j] < 0
+            if bool(slid[j]) != bool(sides[j]):
+                words = ("leaves", "rests") if on else ("lets go", "stops")
+                hit.append((words[not sides[j]], j, on or sides[j] or slid[j]))
+            elif turned:
+                hit.append(("turns", j, slid[j]))
+        # The first of what happens at once has the energy.
+        events += [Event(t, kind, j, way, q, before, v, 0 if k else lost) for k, (kind, j, way) in enumerate(hit)]
     return events, (q, v, t)
