@@ -132,7 +132,7 @@ class EnergyModel(Model):
         s = self.form
         flags = dict.fromkeys(Needs.__dataclass_fields__, False)
         flags |= {"damping": any(x != 0 for x in (s.dissipation, *s.forces)), "time": s.time is not None}
-        return Needs(**flags | {"loops": bool(s.constraints), "no_slip": self.holds_velocities})
+        return Needs(**flags | {"loops": bool(s.constraints), "no_slip": self.holds_velocities, "stops": bool(s.stops)})
 
     @cached_property
     def digest(self) -> str:

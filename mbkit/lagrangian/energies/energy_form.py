@@ -112,8 +112,7 @@ class EnergyForm:
         values = {s: x for s, x in self.parameters.items() if x is not None}
         self.stops, self.restitution = _stops(into, stops, restitution, values)
         self.coordinates, self.velocities, self.clock = into.coordinates, into.velocities, into.time
-        others = (self.T, self.V, self.dissipation, *self.constraints, *self.velocity_constraints)
-        others = (*others, *self.stops, *self.restitution)
+        others = (self.T, self.V, self.dissipation, *self.constraints, *self.velocity_constraints, *self.stops)
         # The time of dynamicsymbols need not enter by itself.
         self.time = into.time if any(into.time in x.free_symbols for x in (*others, *acting.values())) else None
         moving = {*self.coordinates, *self.velocities, *([self.time] if self.time else [])}

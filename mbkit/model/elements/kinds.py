@@ -241,7 +241,7 @@ _WRITTEN = (
 for _does, _need, _what in _WRITTEN:
     register_kind("", f"written.{_does}", f"{{p.name}} has {_what}", _does, at=partial(_written_with, _need))
 # Only paper writes them out.
-_WORDS = "{p.name} has stops on paper: stops[0] is {p.form.stops[0]!s:.80} >= 0 (engines run those of a model's joints)"
+_WORDS = "{p.name} has stops on paper, where engines run those of joints: stops[0] is {p.form.stops[0]!s:.80} >= 0"
 register_kind("", "written.stop", _WORDS, at=lambda m, _: not m.has_bodies and bool(m.form.stops))
 register_kind("", "gravity", "gravity", "V", "gravity", "gravity")
 # Armature of a free joint is a body, whose weight a compensation holds.
