@@ -60,11 +60,14 @@ def after_impacts(jumps: Jumps, dyn: Any, q: Array, v: Array, *, rebound: bool =
 
 
 def over(jumps: Jumps, dyn: Any, q: Array, v: Array, which: Mask) -> StopImpacts:
-    """Return the velocities when the bounces of some velocities, (N, nv), have come to their end, as if at once."""
+    """Return the velocities, (N, nv), when the bounces of some have come to their end, as if at once.
+
+    What rests on a stop goes on to rest: the pushes of bounces and of weights are those of the same time.
+    """
     A = np.broadcast_to(jumps.responses(dyn, q), (*v.shape, v.shape[-1]))
-    P = -restricted(A, v, which, definite=not dyn.model.constrained)
-    at_rest = np.where(which, 0.0, v + (A @ P[..., None])[..., 0])
-    return StopImpacts(after_impacts(jumps, dyn, q, at_rest, rebound=False).v, which, 0.5 * P * v)
+    rests = which | ((v == 0) & (jumps.law_of(dyn).stops.against(q) != 0))
+    P = -restricted(A, v, rests, definite=not dyn.model.constrained)
+    return StopImpacts(np.where(rests, 0.0, v + (A @ P[..., None])[..., 0]), which, 0.5 * P * v)
 
 
 def between_stops(

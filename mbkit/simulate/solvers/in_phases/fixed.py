@@ -562,6 +562,8 @@ class _PartOfStep:
         # A speed that is zero at the end may have faded out long before.
         faded = over.min(axis=1) > -noise
         unit = np.where(faded, STOPPED / (2 * _MAX_NOISE), noise)[:, None]
+        # Coordinates are rounded less than speeds: a joint beside its stop may move by little.
+        unit = unit * np.where(self._run.phases.with_stops, 1 / _MAX_NOISE, 1.0)
         before = np.where(at_once[:, None], now, np.maximum(soon, 2 * noise[:, None])) / unit
         after = np.where(at_once[:, None], soon, over) / unit
         out, open_ = np.zeros(len(i)), np.flatnonzero(before.min(axis=1) > 0)

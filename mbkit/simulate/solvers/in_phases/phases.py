@@ -230,7 +230,7 @@ class Phases:
         self._names = dyn.model.velocity_names
         #: Velocities with friction or stops. The law of all samples is made here, so that those of some are its rows.
         law = self._own.law_of(dyn)
-        self.which, self._stops = law.which, law.stops
+        self.which, self._stops, self.with_stops = law.which, law.stops, law.stops.which[law.which]
         self._rubs = np.isin(np.arange(dyn.model.nv), self.which)
         layout = dyn.model.layout
         places = (
@@ -458,13 +458,16 @@ class Phases:
         new, hits, taken = after_impacts(self._own, own, states, before)
         _rows(out)[rows] = new
         e, delays, ends, left = self._stops.restitution_at(side), np.zeros(new.shape), hits & False, taken
-        bounces = hits & (side * new > 0)
+        # One that was hit, or that an impact elsewhere sends off.
+        bounces = side * new > 0
         if bounces.any():
             a = own.forward_dynamics(states, new, _rows(applied(force, t, q, out))[rows])
             size = np.maximum(1.0, np.abs(np.where(side > 0, *self._stops.bounds)))
             ends = bounces & (side * a < 0) & (new**2 <= 2 * np.abs(a) * FLAT * size)
             if ends.any():
-                delays = np.where(ends & (e < 1), 2 * np.abs(new) / np.where(ends, np.abs(a) * (1 - e), 1.0), 0.0)
+                delays = np.where(
+                    ends & hits & (e < 1), 2 * np.abs(new) / np.where(ends, np.abs(a) * (1 - e), 1.0), 0.0
+                )
                 _rows(out)[rows], _, left = over(self._own, own, states, new, ends)
         _rows(leaving)[rows] = 0.0
         for k in np.flatnonzero(hits.any(axis=1)).tolist():
@@ -473,7 +476,7 @@ class Phases:
                 name = partial(self._stops.event, i, side[k, i])
                 impacts.append(Impact(int(rows[k]), i, name("hits"), 0.0, told, float(taken[k, i])))
                 told = None
-                if ends[k, i]:
+                if ends[k, i] and e[k, i]:
                     last = float(delays[k, i]), None, float(left[k, i])
                     impacts.append(Impact(int(rows[k]), i, name("comes to rest on"), *last))
         return out, leaving, impacts
