@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from mbkit.studies.explain import explain as explain
     from mbkit.studies.importers import compare_parsers as compare_parsers
     from mbkit.studies.lint import lint as lint
+    from mbkit.studies.soft_stops import soft_stops as soft_stops
     from mbkit.studies.stress.study import stress as stress
     from mbkit.studies.work_precision.study import work_precision as work_precision
 
@@ -83,6 +84,7 @@ _NAMES = {
     "studies.explain": "explain",
     "studies.importers": "compare_parsers",
     "studies.lint": "lint",
+    "studies.soft_stops": "soft_stops",
 }
 _HOME = {name: f"mbkit.{module}" for module, names in _NAMES.items() for name in names.split()}
 # `show` and `simulate` are called too; methods and events are in the second.

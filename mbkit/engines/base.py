@@ -204,7 +204,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         >>> float(dyn.mass_matrix([0.0])[0, 0]), float(dyn.at(m=3.0).mass_matrix([0.0])[0, 0])
         (2.0, 3.0)
         """
-        return self._at_time(values) or type(self)(self.model.with_nominal(single_values(values)))
+        rebuilt, (model, *choices) = self.__reduce__()
+        return self._at_time(values) or rebuilt(model.with_nominal(single_values(values)), *choices)
 
     def _at_time(self, values: Mapping[str, Any]) -> Self | None:
         """Return the same dynamics, with all that was built, at another time; None for other values."""
@@ -656,6 +657,7 @@ class WrenchedDynamics(Dynamics):
     def __init__(self, dyn: Dynamics, frames: tuple[Frame, ...], axes: str) -> None:
         self._bare, self._acting, self._path = dyn, (frames, axes), dyn._path
         self._soft_constraints, self._soft_jumps = dyn._soft_constraints, dyn._soft_jumps
+        self._soft_limits = dyn._soft_limits
         super().__init__(dyn.model)
         self._forward_dynamics = dyn._method("forward_dynamics")
         dyn._method("jacobian")

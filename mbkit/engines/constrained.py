@@ -15,7 +15,8 @@ from mbkit._imports import from_above
 from mbkit._reproducible import dependent, unit_rows
 from mbkit.engines.elements.stop_impacts import between_stops
 from mbkit.engines.evaluation import Evaluation
-from mbkit.errors import InputError, MbkitWarning, NumericalError, warn
+from mbkit.errors import InputError, MbkitWarning, NumericalError, UnsupportedError, warn
+from mbkit.model import Model
 from mbkit.model.elements.paths import ALL, Path
 
 #: Words of each error of such a pose: no shorter step helps there.
@@ -44,6 +45,18 @@ def singular_pose(who: str, name: str, rows: Sequence[str], J: Array) -> Numeric
         f"{sizes[0]:.2g} down to {sizes[-1]:.2g}): accelerations and forces are not determined there; take a pose "
         "beside it"
     )
+
+
+def softly_limited(engine: str, model: Model, limits: object) -> tuple[Model, tuple[str, ...]]:
+    """Return a model as it is beside an engine's own limits, and the joints that have some; `limits` is its option."""
+    if limits not in (None, "soft"):
+        raise InputError(f"limits: expected 'soft' or None, got {limits!r}")
+    joints = model.acts.get("joint.limit", ()) if limits else ()
+    if not joints:
+        return model, ()
+    if model.layout.reduced:
+        raise UnsupportedError(f"limits: {engine}'s do not act on {model.name}'s mimic joints; load with mimic='free'")
+    return model.without("stops"), joints
 
 
 @contextmanager
@@ -86,9 +99,11 @@ class Constrained(Evaluation):
     #: Options with which the engine has a soft law of its own for forces that jump, and whether it has.
     _soft_jump_options: ClassVar[Mapping[str, Any]] = {}
     _soft_jumps: bool = False
+    #: Whether joint limits are the engine's own, which are soft.
+    _soft_limits: bool = False
 
     def _jumps_beside_passive(self, q: Array, v: Array, tau: Array) -> Array:  # noqa: ARG002  # of a soft law
-        """Return the forces that jump in accelerations under τ, less those in `passive`; (N, nv)."""
+        """Return the forces of soft laws in accelerations under τ, less those in `passive`; (N, nv)."""
         return np.zeros_like(v)
 
     @property

@@ -273,8 +273,9 @@ def dynamics(model: Model, engine: str | EngineVersion = PINOCCHIO, **options: A
         ``"mujoco-warp"``, ``"mjx"`` and ``"mjx-single"``.
     **options
         The lagrangian engine's ``compile=`` (True or False), ``threads=`` and ``device=`` ("cuda" for batches on an
-        NVIDIA GPU); MuJoCo's ``solref=`` and ``solimp=`` of
-        the soft constraints that hold loops; other engines have none.
+        NVIDIA GPU); MuJoCo's ``solref=`` and ``solimp=`` of the soft constraints that hold loops, its
+        ``soft_friction=True``, and ``limits="soft"`` with ``limit_solref=`` for joint limits of its own; Drake's
+        ``limits="soft"``; other engines have none.
 
     Returns
     -------

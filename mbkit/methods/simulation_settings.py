@@ -82,6 +82,8 @@ class Settings:
         Of the joints that have one; the others get the control as a torque.
     control_period : float
         s; the controller is asked this often, and its answer is held.
+    limit_softness : tuple of (str, solref, solimp)
+        Of the joints whose limits have another softness than MuJoCo's own.
     """
 
     engine: str | None = None
@@ -94,6 +96,7 @@ class Settings:
     limits: bool | None = None
     servos: tuple[Servo, ...] | None = None
     control_period: float | None = None
+    limit_softness: tuple[tuple[str, tuple[float, ...], tuple[float, ...]], ...] | None = None
 
     def __post_init__(self) -> None:
         for name in ("time_step", "control_period"):
@@ -124,6 +127,7 @@ WORDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
         "tolerance": ("solver tolerance", ""),
         "limits": ("joint limits", ""),
         "control_period": ("control period", "s"),
+        "limit_softness": ("softness of joint limits", ""),
         "kind": ("servo", ""),
         "kp": ("servo kp", ""),
         "kv": ("servo kv", ""),

@@ -107,7 +107,7 @@ def diagnostics(
         whole = [i for i in range(members) if len(samples[i]) == len(times)]
         fast = [_fastest(v[i]) if quick else at_v[i, 0] for i in whole]
         limit = _MAX_ENERGY_CHANGE_LOW_ORDER if method.order in _LOW_ORDERS else _MAX_ENERGY_CHANGE_HIGH_ORDER
-        damped = model.loses_energy or (model.constrained and dyn._soft_constraints)
+        damped = model.loses_energy or dyn._soft_limits or (model.constrained and dyn._soft_constraints)
         checks.append(energy_drift([samples[i] for i in whole], fast, damped, limit))
     # Neither the engine nor the method may solve with the mass matrix.
     matrices = [one.M for member in samples for one in member]

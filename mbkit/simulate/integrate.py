@@ -32,10 +32,10 @@ from mbkit.simulate.torque import RunWrenches, Torque, TorqueFunction
 
 _OTHERS: Final = f"use {DEFAULT_METHOD!r} or {ADAPTIVE_METHOD!r}"
 _DRY: Final = EFFECTS["jump"]
+_UNKNOWN: Final = {x: f"this method does not know {EFFECTS[x]}" for x in ("stop", "jump")}
+_UNKNOWN["stop"] += " (limits='soft' of mujoco and drake has their own instead)"
 #: Methods without events and equal steps, at which a joint could stop or let go.
-SMOOTH_RUNS: Final = Path(
-    "runs without phases", "", ALL - {"jump"}, {"jump": f"this method does not know {_DRY}"}, instead=_OTHERS
-)
+SMOOTH_RUNS: Final = Path("runs without phases", "", ALL - {"jump"}, _UNKNOWN, instead=_OTHERS)
 #: Smallest rtol of Taylor's method on the oracle, which computes with 113 bits.
 _MIN_RTOL_EXTENDED: Final = 1e-32
 #: Cost of an evaluation from Python, in evaluations in machine code.
@@ -75,7 +75,8 @@ def integrate(
             raise UnsupportedError(f"{chosen.name}: {what} are not there with this method; use {others}")
     if model.needs.stops and (beyond := StopLaw(model).beyond(q)):
         raise InputError(f"q0: {beyond}; start between the stops, or where dyn.project(q, v) leads")
-    _warn_beyond_limits(model, q)
+    if not dyn._soft_limits:
+        _warn_beyond_limits(model, q)
     if model.jumping_forces:
         warn(
             f"{model.name}: {', '.join(model.jumping_forces)} jumps where a velocity changes its sign. There it holds "
@@ -220,7 +221,8 @@ def _outcome(problem: IntegrationProblem, method: Method, in_parts: InParts | No
         )
     native = method.kind == "native"
     if not dyn._soft_jumps and (native or not (method.events or problem.equal_steps)):
-        own = ", ".join(f"{name}={value}" for name, value in dyn._soft_jump_options.items() if native)
+        options = dyn._soft_jump_options if native and dyn.model.needs.friction else {}
+        own = ", ".join(f"{name}={value}" for name, value in options.items())
         soft = f" (mbkit.dynamics(model, {dyn.engine!r}, {own}) has {_DRY} of its own, which is soft)" if own else ""
         SMOOTH_RUNS.admit(dyn.model, f"{method.name}{soft}: not known of")
     elif not dyn._soft_jumps:

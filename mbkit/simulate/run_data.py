@@ -542,8 +542,8 @@ def _with_rate(
 
 
 def _driven(dyn: Dynamics) -> bool:
-    """Return whether constraints do work."""
-    return dyn.model.constrained and (dyn._soft_constraints or dyn.model.constraints_do_work)
+    """Return whether constraints do work, among them soft limits."""
+    return dyn._soft_limits or (dyn.model.constrained and (dyn._soft_constraints or dyn.model.constraints_do_work))
 
 
 def _lost_power(dyn: Dynamics, q: Array, v: Array, tau: Array) -> Array:
@@ -556,9 +556,9 @@ def _lost_power(dyn: Dynamics, q: Array, v: Array, tau: Array) -> Array:
     if model.needs.damping:
         # At rest the passive force is that of springs; forces by functions are counted above.
         force = force + _dampers(dyn, q, v) - _dampers(dyn, q, np.zeros_like(v))
-    if dyn._soft_jumps:
+    if dyn._soft_jumps or dyn._soft_limits:
         force = force + dyn._jumps.law_of(dyn).force(v) + dyn._jumps_beside_passive(q, v, tau)
-    if _driven(dyn):
+    elif _driven(dyn):
         force = force + dyn.generalized_constraint_force(q, v, tau)
     return np.asarray(np.sum(force * v, axis=-1))
 

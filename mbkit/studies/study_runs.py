@@ -15,7 +15,9 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.engines import Dynamics
 from mbkit.engines.applications.random_states import states_of
+from mbkit.engines.registry import find_engine
 from mbkit.errors import InputError, MbkitError, MbkitWarning
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
@@ -114,6 +116,8 @@ class Checkpointer:
             warnings.warn(f"checkpoint: {message}; the study goes on", MbkitWarning, stacklevel=4)
 
 
+#: Random states from which limits are looked for.
+_RUNS_TO_LIMITS: Final = 16
 #: The note of what was left out because no time was left.
 OUT_OF_TIME: Final = "not run: the time allowed was used up"
 
@@ -163,6 +167,19 @@ def start_state(model: Model, seed: int) -> tuple[Array, Array]:
         # A motion in time has the velocity that it has.
         return states_of(model).manifold.project(q, 0.1 * v)
     return q, 0.1 * v
+
+
+def runs_to_limits(dyn: Dynamics, duration: float, seed: int) -> tuple[Trajectory, list[tuple[float, int, int]]]:
+    """Return free runs from random states within the limits, and time, run and coordinate of the first limits reached.
+
+    The earliest is the first, each run has one at most.
+    """
+    model = dyn.model
+    start = model.random_state(np.random.default_rng([seed, 3]), size=_RUNS_TO_LIMITS)
+    run = quiet_simulate(dyn, *start, duration, find_engine(dyn.engine).rk4, dt=1e-3)
+    beyond = (run.q < model.lower) | (run.q > model.upper)
+    first = {i: np.argwhere(rows)[0].tolist() for i, rows in enumerate(beyond) if rows.any()}
+    return run, sorted((float(run.t[k]), i, coordinate) for i, (k, coordinate) in first.items())
 
 
 def whole_steps(interval: float, step: float) -> int:

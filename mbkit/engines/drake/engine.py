@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -39,6 +39,7 @@ from mbkit import _process as _interrupt
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit.engines.base import MappedDynamics
+from mbkit.engines.constrained import softly_limited
 from mbkit.engines.drake.model import DRAKE, DRAKE_RUNS, DRAKE_SAP, NO_CONSTRAINTS, SAP, DrakeModel, build
 from mbkit.engines.frames_and_momenta import Composed, MovingFrames
 from mbkit.errors import NumericalError, UnsupportedError
@@ -209,11 +210,15 @@ _WITHOUT_LOOPS: Final = {
 }
 
 
+_OF_LIMITS: Final = f"limits='soft' of {{model}} act in Drake's discrete plant alone; method={SAP!r} runs it"
+
+
 class DrakeDynamics(DrakeBodies, MappedDynamics):
     """Drake on a description.
 
     Of a model with loops the terms are those of the tree, and its runs are Drake's discrete ones: loops are among the
-    constraints of the discrete plant alone.
+    constraints of the discrete plant alone. So are joint limits, with ``limits="soft"``: nearly rigid, as stiff as the
+    step allows. Rigid stops give way to them, so that `model` is here without; terms and other runs have no limits.
 
     Attributes
     ----------
@@ -232,12 +237,19 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
         "coriolis_matrix": "Drake forms C v without the matrix; nle(q, v) - gravity(q) is C v",
     }
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Model, *, limits: str | None = None) -> None:
+        model, limited = softly_limited(self.engine, model, limits)
         super().__init__(model)
         if model.constrained:
             parts = {"model": model.name, "parts": model.constraint_parts}
             vars(self)["_refuses"] = self._refuses | {k: why.format(**parts) for k, why in _WITHOUT_LOOPS.items()}
+        if limited:
+            self._soft_limits = True
+            vars(self)["_refuses"] = self._refuses | {"forward_dynamics": _OF_LIMITS.format(model=model.name)}
         self._hold(build(model))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return partial(type(self), limits="soft" if self._soft_limits else None), (self.model,)
 
     def _hold(self, compiled: DrakeModel) -> None:
         self.maps, self.plant, self._v_index = compiled, compiled.plant, compiled.v_index
@@ -453,6 +465,8 @@ class DrakeRun(_PlantState):
         watch: Callable[[float], object],
     ) -> None:
         DRAKE_RUNS.admit(dyn.model)
+        if dyn._soft_limits:
+            raise UnsupportedError(f"drake: {dyn._refuses['forward_dynamics']}")
         super().__init__(dyn, dyn.maps)
         self.put(q, v)
         simulator = Simulator(self._plant, self._context)
@@ -507,7 +521,7 @@ class DiscreteRun(_PlantState):
 
     def __init__(self, dyn: DrakeDynamics, dt: float) -> None:
         DRAKE_SAP.admit(dyn.model)
-        super().__init__(dyn, build(dyn.model, step=dt))
+        super().__init__(dyn, build(dyn.model, step=dt, limits=dyn._soft_limits))
 
     def step(self, q: Array, v: Array, tau: Array) -> tuple[Array, Array]:
         """Return q and v a step after a state, under a force."""

@@ -49,11 +49,13 @@ class DrakeModel:
     bushings: tuple[tuple[float, Any, Array, Any, Array], ...]
 
 
-def build(description: Model, *, gravity: bool = True, bushings: bool = True, step: float = 0.0) -> DrakeModel:
+def build(
+    description: Model, *, gravity: bool = True, bushings: bool = True, step: float = 0.0, limits: bool = False
+) -> DrakeModel:
     """Return the plant, with or without gravity and the springs that have no length at rest.
 
-    With a step, s, it is discrete and holds the loops; a continuous one is the tree alone. Raises `UnsupportedError`
-    for numbers that Drake refuses, and names the part.
+    With a step, s, it is discrete and holds the loops, and `limits` of joints; a continuous one is the tree alone.
+    Raises `UnsupportedError` for numbers that Drake refuses, and names the part.
     """
     # A step of zero makes it continuous: ẋ = f(x) and nothing else.
     plant = MultibodyPlant(step)
@@ -67,6 +69,9 @@ def build(description: Model, *, gravity: bool = True, bushings: bool = True, st
         # Names of files may hold what Drake's do not; ours are kept in the map.
         bodies[body.name] = plant.AddRigidBody(f"{k}:{body.name}", _inertia(body, body.name in static))
     added = {joint.name: _add(plant, joint, bodies) for joint in description.joints}
+    for joint in description.joints if limits else ():
+        for k, one in enumerate(added[joint.name] if joint.type.nq == len(joint.lower) > 0 else ()):
+            one.set_position_limits(joint.lower[k : k + 1], joint.upper[k : k + 1])
     springs = [s for s in description.springs if bushings or s.rest_length > 0]
     bushings_ = tuple(x for spring in springs for x in _add_spring(plant, spring, bodies))
     ends = dict(bodies)

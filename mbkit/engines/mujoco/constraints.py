@@ -22,7 +22,7 @@ below the bound a joint creeps, at a rate at which b J v makes up for R f.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -99,6 +99,12 @@ class Softness:
         else:
             y = 1 - (1 - x) ** power / (1 - midpoint) ** (power - 1)
         return float(low + y * (high - low))
+
+
+def limit_softness(m: Any, joints: Iterable[str]) -> dict[str, Softness]:
+    """Return how soft the limits of these joints are in a compiled file, of those that have some there."""
+    own = (m.joint(int(j)) for j in np.flatnonzero(m.jnt_limited))
+    return {x.name: Softness(tuple(x.solref.tolist()), tuple(x.solimp.tolist())) for x in own if x.name in joints}
 
 
 def _numbers(name: str, x: Any, size: int) -> Array:
@@ -187,12 +193,14 @@ def law(
     MuJoCo's are M, J, r, the smooth force and the estimates of the inverse weights; nothing of its solver is.
     `turned` and `columns` turn an acceleration and a Jacobian into the description's coordinates.
     """
-    J, r = np.array(d.efc_J).reshape(-1, m.nv), np.array(d.efc_pos)
+    # Rows of soft limits stand beside them.
+    loops = d.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+    J, r = np.array(d.efc_J).reshape(-1, m.nv)[loops], np.array(d.efc_pos)[loops]
     rate, bias = J @ d.qvel, np.concatenate([_bias(m, d, i) for i in range(m.neq)])
     stiffness, damping = softness.gains
     impedance, estimate = np.empty(len(r)), np.empty(len(r))
     for i in range(m.neq):
-        own = np.flatnonzero(d.efc_id == i)
+        own = np.flatnonzero(d.efc_id[loops] == i)
         impedance[own] = softness.impedance(float(np.linalg.norm(r[own])))
         if m.eq_type[i] == OF_JOINTS:
             estimate[own] = sum(m.dof_invweight0[m.jnt_dofadr[j]] for j in (m.eq_obj1id[i], m.eq_obj2id[i]))

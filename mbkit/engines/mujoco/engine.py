@@ -12,9 +12,10 @@ from __future__ import annotations
 import contextlib
 import copy
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import mujoco
@@ -23,17 +24,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit import spatial
-from mbkit._attributes import single_values
 from mbkit._check import Array, batch_of, count, real, shown
 from mbkit._child_process import cores
 from mbkit._process import LOOK_SECONDS
 from mbkit.engines import known_defects
 from mbkit.engines.base import MappedDynamics
 from mbkit.engines.closed_loops.rows_of_frames import RowsOfFrames
-from mbkit.engines.constrained import off_by
+from mbkit.engines.constrained import off_by, softly_limited
 from mbkit.engines.frames_and_momenta import TREE
 from mbkit.engines.mujoco.bodies import MujocoBodies
-from mbkit.engines.mujoco.constraints import ConstraintLaw, LoopEnds, Softness, friction_law, law
+from mbkit.engines.mujoco.constraints import ConstraintLaw, LoopEnds, Softness, friction_law, law, limit_softness
 from mbkit.engines.mujoco.model import (
     CONSTRAINT_LAW,
     FRICTION_LOSS,
@@ -47,12 +47,14 @@ from mbkit.engines.mujoco.model import (
 from mbkit.errors import (
     DoubtfulRunWarning,
     InputError,
+    MbkitError,
     MbkitWarning,
     NumericalError,
     UnsupportedError,
     require_known,
     warn,
 )
+from mbkit.load.sanitized_text import strip
 from mbkit.model import Model
 
 if TYPE_CHECKING:
@@ -188,6 +190,8 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         Of its equality constraints, which hold the loops, and of its friction loss.
     soft_friction : bool
         Whether dry friction is MuJoCo's own.
+    limit_softness : dict of Softness, optional
+        Of each joint with limits, where they are MuJoCo's own.
 
     Notes
     -----
@@ -200,6 +204,11 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
     Dry friction of joints is exact, by mbkit, beside MuJoCo's terms. With ``soft_friction=True`` it is MuJoCo's own
     friction loss in accelerations and runs, a soft constraint too: joints at rest creep. `constraint_law` tells how
     far that is from exact friction; other terms have exact friction at speed.
+
+    Limits of joints are off. With ``limits="soft"`` they are MuJoCo's own, soft constraints too, in accelerations and
+    runs; rigid stops of the model give way to them, so that `model` is here without. They are as soft as the MJCF says
+    that the model was loaded from, or as MuJoCo's default; `limit_solref` is for all joints, and `limits` may be a dict
+    of `Softness` by joint. `mbkit.soft_stops` measures how far they are from rigid stops.
     """
 
     engine = "mujoco"
@@ -218,6 +227,7 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         "and generalized_constraint_force(q, v, tau) is Jᵀ λ",
     }
     softness = Softness()
+    limit_softness: Mapping[str, Softness] | None = None
     _soft_jump_options: ClassVar[dict[str, Any]] = {"soft_friction": True}
 
     def __init__(
@@ -227,23 +237,34 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         solref: ArrayLike | None = None,
         solimp: ArrayLike | None = None,
         soft_friction: bool = False,
+        limits: str | Mapping[str, Softness] | None = None,
+        limit_solref: ArrayLike | None = None,
     ) -> None:
         if not isinstance(soft_friction, (bool, np.bool_)):
             raise InputError(f"soft_friction: expected True or False, got {shown(soft_friction)}")
+        own = dict(limits) if isinstance(limits, Mapping) else {}
+        model, limited = softly_limited(self.engine, model, "soft" if own else limits)
+        require_known("joint with limits", limited, *own)
         # Without friction there is nothing to hold.
         self._soft_jumps = bool(soft_friction) and "jump" in model.effects
         self._path = FRICTION_LOSS if self._soft_jumps else MUJOCO
         super().__init__(model)
         self.softness = Softness.of(solref, solimp)
-        self._hold(build(model, softness=self.softness, soft_friction=self._soft_jumps))
+        if limit_solref is not None and not limits:
+            raise InputError("limit_solref: is of soft limits; give limits='soft' too")
+        if limited:
+            if "jump" in model.effects and not self._soft_jumps:
+                raise UnsupportedError(f"limits: not beside exact friction of {model.name}; give soft_friction=True")
+            held = {joint: Softness() for joint in limited} | _of_file(model, limited)
+            if limit_solref is not None:
+                ref = Softness.of(limit_solref).solref
+                held = {joint: replace(x, solref=ref) for joint, x in held.items()}
+            self._soft_limits, self.limit_softness = True, held | own
+        self._hold(build(model, softness=self.softness, soft_friction=self._soft_jumps, limits=self.limit_softness))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuilt, (type(self), self.model, self.softness, self._soft_jumps)
-
-    def at(self, /, **values: Any) -> MujocoDynamics:
-        return self._at_time(values) or _rebuilt(
-            type(self), self.model.with_nominal(single_values(values)), self.softness, self._soft_jumps
-        )
+        own: Any = vars(self.softness) | {"soft_friction": self._soft_jumps, "limits": self.limit_softness}
+        return partial(type(self), **own), (self.model,)
 
     def _hold(self, compiled: MujocoModel) -> None:
         self._maps = compiled
@@ -258,7 +279,7 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         self._d = mujoco.MjData(self._m)
         # Model and data with what is soft; all terms but the accelerations are those of the tree.
         self._closed = self._m, self._d
-        if self.model.needs.loops or self._soft_jumps:
+        if self.model.needs.loops or self._soft_jumps or self._soft_limits:
             self._m = copy.copy(self._m)
             self._m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
             self._d = mujoco.MjData(self._m)
@@ -381,10 +402,11 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         return np.asarray(out), forces[-1]
 
     def _jumps_beside_passive(self, q: Array, v: Array, tau: Array) -> Array:
-        if not self._soft_jumps:
+        if not (self._soft_jumps or self._soft_limits):
             return super()._jumps_beside_passive(q, v, tau)
-        laws = [self.constraint_law(*state) for state in zip(q, v, tau, strict=True)]
-        return np.array([x.jacobian.T @ x.force for x in laws]) - self._jumps.law.force(v)
+        with self._lock, heard_warnings():
+            forces = [self._generalized_constraint_force(*state) for state in zip(q, v, tau, strict=True)]
+        return np.array(forces) - self._jumps.law.force(v)
 
     def _smooth_acceleration(self, q: Array, v: Array, tau: Array) -> Array:
         """Return the accelerations without any constraint."""
@@ -597,10 +619,12 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         self._require_loops_that_meet()
         model = copy.copy(self.mj_model)
         model.body_gravcomp[:], model.jnt_stiffness[:] = self._own_forces
-        if (self.model.needs.loops or self._soft_jumps) and 0 < self.softness.solref[0] < 2 * dt:
+        used = [self.softness] if self.model.needs.loops or self._soft_jumps else []
+        short = [x.solref[0] for x in (*used, *(self.limit_softness or {}).values()) if 0 < x.solref[0] < 2 * dt]
+        if short:
             warn(
                 f"{self.model.name}: MuJoCo raises the time constant of its constraints from "
-                f"{self.softness.solref[0]:g} s to two steps, {2 * dt:g} s",
+                f"{min(short):g} s to two steps, {2 * dt:g} s",
                 DoubtfulRunWarning,
             )
         if euler_damping:
@@ -608,10 +632,13 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         return rollout(self.model, replace(self._maps, model=model), integrator, q0, v0, dt, tau, steps, progress)
 
 
-def _rebuilt(
-    kind: type[MujocoDynamics], model: Model, softness: Softness, soft_friction: bool = False
-) -> MujocoDynamics:
-    return kind(model, solref=softness.solref, solimp=softness.solimp, soft_friction=soft_friction)
+def _of_file(model: Model, joints: Iterable[str]) -> dict[str, Softness]:
+    """Return how soft the limits of joints are in the MJCF that a model was loaded from, where there is one to read."""
+    if model.source.lower().endswith((".xml", ".mjcf")):
+        with contextlib.suppress(MbkitError, OSError, ValueError), heard_warnings():
+            file = strip(Path(model.source))
+            return limit_softness(mujoco.MjModel.from_xml_string(file.text, file.meshes), joints)
+    return {}
 
 
 class Variant:

@@ -13,7 +13,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit._escape import xml_attribute, xml_comment
-from mbkit.engines.mujoco.constraints import OF_JOINTS, OF_TENDON
+from mbkit.engines.mujoco.constraints import OF_JOINTS, OF_TENDON, Softness
 from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.mujoco.model import INERTIA, MUJOCO, OF_COUPLING, Placed, by_mbkit, heard_warnings, mapped, specified
 from mbkit.errors import MbkitError, UnsupportedError
@@ -76,7 +76,8 @@ def mjcf_text(model: Model, comment: str, settings: Settings | None = None) -> s
     With settings of a simulation the text has them too: options and actuators.
     """
     MJCF.admit(model)
-    spec, placed, _ = specified(model)
+    held: Any = (settings.limit_softness if settings else None) or ()
+    spec, placed, _ = specified(model, limits={joint: Softness(*numbers) for joint, *numbers in held})
     lines = [
         f"<mujoco model={xml_attribute(model.name)}>",
         f"  <!-- {xml_comment(comment)} -->",
@@ -197,6 +198,8 @@ def _joint(joint: Any, owner: Joint) -> str:
         # 2 is MuJoCo's "as the range says".
         if int(joint.limited) == 1:
             attributes |= {"limited": "true", "range": joint.range}
+            if Softness(tuple(joint.solref_limit), tuple(joint.solimp_limit)) != Softness():
+                attributes |= {"solreflimit": joint.solref_limit, "solimplimit": joint.solimp_limit}
         if owner.type.nv == 1 and 0 < owner.effort_limit[0] < np.inf:
             effort = owner.effort_limit[0]
             attributes |= {"actuatorfrclimited": "true", "actuatorfrcrange": (-effort, effort)}

@@ -75,6 +75,8 @@ _BALL, _FREE = mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE
 _X, _Y, _Z = np.eye(3)
 # A ball joint can only be the last of a stack: its quaternion is in the body's own axes.
 _STACKABLE: Final = tuple(STACKS)
+#: The softness of each joint whose limits act.
+Limits = Mapping[str, Softness] | None
 #: Numbers of a coupling that a tendon has by the same name, its inertia among them.
 OF_COUPLING: Final = tuple(name for name, rule in rules_of(JointCoupling).items() if rule.does)
 (INERTIA,) = JointCoupling.adding_to("T")
@@ -102,15 +104,17 @@ def build(
     *,
     softness: Softness | None = None,
     soft_friction: bool = False,
+    limits: Limits = None,
     spheres: bool = False,
     shapes: Sequence[Shape] | None = None,
 ) -> MujocoModel:
     """Compile the description, with shapes to draw and sites of its frames where shapes are given, if only none.
 
-    `soft_friction` leaves MuJoCo's friction loss on. `spheres` gives every body a sphere of 1 µm, to measure the cost
-    of geometry. Raises `UnsupportedError` for a body that MuJoCo refuses, and names it.
+    `soft_friction` leaves MuJoCo's friction loss on, `limits` its joint limits, each as soft as it says. `spheres`
+    gives every body a sphere of 1 µm, to measure the cost of geometry. Raises `UnsupportedError` for a body that MuJoCo
+    refuses, and names it.
     """
-    spec, placed, disabled = specified(description, softness, soft_friction)
+    spec, placed, disabled = specified(description, softness, soft_friction, limits)
     if spheres:
         for name, body in placed.bodies.items():
             if name != "world":
@@ -146,7 +150,7 @@ class Placed:
 
 
 def specified(
-    description: Model, softness: Softness | None = None, soft_friction: bool = False
+    description: Model, softness: Softness | None = None, soft_friction: bool = False, limits: Limits = None
 ) -> tuple[Any, Placed, tuple[str, ...]]:
     """Return the specification, not compiled yet, the places of the parts in it, and the features that are off."""
     spec = mujoco.MjSpec()
@@ -156,7 +160,7 @@ def specified(
     compiler.balanceinertia, compiler.fusestatic, compiler.inertiafromgeom = False, False, 0
     compiler.boundmass = compiler.boundinertia = 0.0
     compiler.alignfree = False
-    disabled = _switch_off(spec, description, soft_friction)
+    disabled = _switch_off(spec, description, soft_friction, limits is not None)
     placed = _add_tree(spec, description)
     for name, spring in turning_springs(description).items():
         spec.joint(name).stiffness[0] = spring.stiffness[5, 5]
@@ -178,8 +182,12 @@ def specified(
         for name in (x for joint in description.joints if joint.friction.any() for x in placed.joints[joint.name]):
             spec.joint(name).solref_friction = (softness or Softness()).solref
             spec.joint(name).solimp_friction = (softness or Softness()).solimp
-    if soft_friction or description.needs.loops:
-        _solve_to_rounding(spec, softness or Softness())
+    for joint, held in (limits or {}).items():
+        for name in placed.joints[joint]:
+            spec.joint(name).solref_limit, spec.joint(name).solimp_limit = held.solref, held.solimp
+    used = [softness or Softness()] if soft_friction or description.needs.loops else []
+    if used := [*used, *(limits or {}).values()]:
+        _solve_to_rounding(spec, used)
     return spec, placed, disabled
 
 
@@ -197,10 +205,6 @@ _OFF: Final = {
     "warm start": "WARMSTART",
     "islands": "ISLAND",
 }
-#: Bits of what holds loops together.
-_FOR_LOOPS: Final = ("EQUALITY", "CONSTRAINT")
-#: And of friction loss.
-_FOR_FRICTION: Final = ("FRICTIONLOSS", "CONSTRAINT")
 _OFF_WITHOUT: Final = {
     "gravity": ("gravity", "GRAVITY"),
     "springs": ("springs", "SPRING"),
@@ -250,8 +254,9 @@ def by_mbkit(description: Model) -> list[Any]:
     return [f for f in description.forces if f not in own]
 
 
-def _switch_off(spec: Any, description: Model, soft_friction: bool) -> tuple[str, ...]:
-    needed = _FOR_LOOPS if description.needs.loops else _FOR_FRICTION if soft_friction else ()
+def _switch_off(spec: Any, description: Model, soft_friction: bool, limits: bool) -> tuple[str, ...]:
+    rows = {"EQUALITY": description.needs.loops, "FRICTIONLOSS": soft_friction, "LIMIT": limits}
+    needed = {bit for bit, there in (rows | {"CONSTRAINT": any(rows.values())}).items() if there}
     bits = {need: bit for need, bit in _OFF.items() if bit not in needed}
     bits |= dict(pair for need, pair in _OFF_WITHOUT.items() if not getattr(description.needs, need))
     if len(by_mbkit(description)) < len(description.forces):
@@ -354,7 +359,7 @@ FRICTION_LOSS: Final = replace(
     MUJOCO,
     name="mujoco friction loss",
     words="soft_friction: MuJoCo's friction loss does not hold the dry friction of",
-    carries=MUJOCO.carries - {"joint.stiction"},
+    carries=MUJOCO.carries - {"joint.stiction", "joint.stop"},
     why={"joint.stiction": "MuJoCo has no static friction and no Stribeck curve", **MUJOCO.why},
     apart=(
         *MUJOCO.apart,
@@ -468,12 +473,11 @@ def _add_loops(spec: Any, description: Model, placed: Placed, softness: Softness
         equality.solref, equality.solimp = softness.solref, softness.solimp
 
 
-def _solve_to_rounding(spec: Any, softness: Softness) -> None:
-    # Newton's solver ends at rounding: equalities alone are linear equations, and friction loss is linear in pieces.
+def _solve_to_rounding(spec: Any, used: Sequence[Softness]) -> None:
+    # Newton's solver ends at rounding: equalities are linear equations, friction loss and limits are linear in pieces.
     spec.option.solver, spec.option.tolerance = mujoco.mjtSolver.mjSOL_NEWTON, 0.0
-    if softness.solref[0] > 0:
-        # MuJoCo raises a time constant to two steps; without steps there is none to raise it for.
-        spec.option.timestep = min(spec.option.timestep, softness.solref[0] / 2)
+    # MuJoCo raises a time constant to two steps; without steps there is none to raise it for.
+    spec.option.timestep = min([spec.option.timestep, *(x.solref[0] / 2 for x in used if x.solref[0] > 0)])
 
 
 def _refusal(description: Model, error: str) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array
+from mbkit.engines.mujoco.constraints import Softness, limit_softness
 from mbkit.engines.mujoco.engine import INTEGRATORS, _turned
 from mbkit.engines.mujoco.mjcf_writer import mjcf_text
 from mbkit.engines.mujoco.model import heard_warnings, mapped, specified
@@ -56,6 +57,7 @@ def settings_of(text: str, files: dict[str, bytes], joints: set[str]) -> tuple[S
     if m.opt.density or m.opt.viscosity:
         left.append("forces of a medium")
     left += _softness(m, limits="LIMIT" not in off)
+    limits = {} if "LIMIT" in off else limit_softness(m, joints)
     held = Settings(
         engine="mujoco",
         integrator=names.get(m.opt.integrator, "mujoco_euler"),
@@ -66,25 +68,22 @@ def settings_of(text: str, files: dict[str, bytes], joints: set[str]) -> tuple[S
         tolerance=float(m.opt.tolerance),
         limits="LIMIT" not in off,
         servos=tuple(servos),
+        limit_softness=tuple((j, x.solref, x.solimp) for j, x in limits.items() if x != Softness()),
     )
     return held, left
 
 
 def _softness(m: Any, *, limits: bool) -> list[str]:
     """Return which constraints have another softness than MuJoCo's own, which a description does not hold."""
-    usual = mujoco.MjModel.from_xml_string(
-        "<mujoco><worldbody><body><joint/><geom size='1'/></body></worldbody></mujoco>"
+    usual, kinds = (
+        Softness(),
+        {
+            "dry friction": (m.dof_solref, m.dof_solimp, m.dof_frictionloss > 0),
+            "equality constraints": (m.eq_solref, m.eq_solimp, m.eq_active0.astype(bool)),
+        },
     )
-    kinds = {
-        "joint limits": ("jnt_solref", "jnt_solimp", m.jnt_limited.astype(bool) & limits),
-        "dry friction": ("dof_solref", "dof_solimp", m.dof_frictionloss > 0),
-        "equality constraints": ("eq_solref", "eq_solimp", m.eq_active0.astype(bool)),
-    }
-    out = []
-    for what, (*names, acts) in kinds.items():
-        own = {n: usual.dof_solref if "ref" in n else usual.dof_solimp for n in names}
-        if any(np.any(getattr(m, n)[acts] != x[0]) for n, x in own.items()):
-            out.append(f"the softness of {what}")
+    other = {x: np.any(r[on] != usual.solref) or np.any(i[on] != usual.solimp) for x, (r, i, on) in kinds.items()}
+    out = [f"the softness of {what}" for what, there in other.items() if there]
     margin = m.jnt_margin[m.jnt_limited.astype(bool)] if limits else np.zeros(0)
     return [*out, *(["the margin of joint limits"] if margin.any() else [])]
 

@@ -20,8 +20,8 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import EPS, Array, by_key
-from mbkit.engines import Dynamics
-from mbkit.engines.registry import DERIVED, MUJOCO, PINOCCHIO
+from mbkit.engines import Dynamics, dynamics
+from mbkit.engines.registry import DERIVED, MUJOCO, PINOCCHIO, find_engine
 from mbkit.methods.registry import DEFAULT_METHOD, EULER_METHOD, METHODS
 from mbkit.model import Model
 from mbkit.model.description import LEFT_OUT, SERVOS
@@ -31,7 +31,7 @@ from mbkit.simulate import Trajectory
 from mbkit.studies.compare.errors import ROUNDINGS, interleaved
 from mbkit.studies.compare.terms import ACTUATORS, LIMITS, STIFF, Finding, Omission, RolloutRow
 from mbkit.studies.results import counted
-from mbkit.studies.study_runs import quiet_simulate, start_state, state_within_limits
+from mbkit.studies.study_runs import quiet_simulate, runs_to_limits, start_state, state_within_limits
 
 #: The step of the rollouts, s.
 STEP: Final = 1e-3
@@ -82,6 +82,22 @@ def _limits(model: Model) -> Finding | None:
     return Finding(LIMITS, f"off here in every engine: {'; '.join(parts)}", every)
 
 
+def reached_limits(model: Model, engines: Mapping[str, Dynamics], seed: int) -> str:
+    """Return how many free motions reach a limit, which first, and by how much stops change that motion's end."""
+    dyn = engines[next(x for x in (DERIVED, MUJOCO, *engines) if x in engines)]
+    run, reached = runs_to_limits(dyn, DURATION, seed)
+    says = f"{len(reached)} of {len(run.q)} motions of {DURATION:g} s from random states within them reach one"
+    if not reached:
+        return says
+    t, i, k = reached[0]
+    stopping = dynamics(model.with_stops(), dyn.engine, **find_engine(dyn.engine).brief)
+    stopped = quiet_simulate(stopping, run.q[i, 0], run.v[i, 0], DURATION, rtol=_STOPPED)
+    off = np.abs(model.difference(run.q[i, -1], stopped.q[-1])).max()
+    return (
+        f"{says}, {model.coordinate_names[k]} first, after {t:.2g} s, whose end rigid stops move by {off:.2g} rad or m"
+    )
+
+
 def stiff_joints(model: Model, M: Array, J: Array | None = None, step: float = STEP) -> list[Finding]:
     """Return the joints whose own damper or spring is faster than a step, s, the fastest first.
 
@@ -119,6 +135,8 @@ def _mobility(M: Array, J: Array | None) -> Array:
 
 
 DURATION: Final = 1.0
+#: Tolerance of a run of which two digits are told.
+_STOPPED: Final = 1e-6
 TOLERANCE: Final = 1e-12
 #: The largest difference of two engines over eps times the condition.
 _MAX_ROUNDINGS: Final = 256.0

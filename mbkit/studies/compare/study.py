@@ -472,7 +472,7 @@ def _build(
             try:
                 # A few dozen states are no reason to compile; run times are.
                 options = {} if compile else find_engine(name).brief
-                own = find_engine(name).load()._soft_jump_options if "jump" in model.effects else {}
+                own = find_engine(name).load()._soft_jump_options if model.needs.friction else {}
                 try:
                     engines[name] = dynamics(model, name, **options, **own)
                 except UnsupportedError as error:

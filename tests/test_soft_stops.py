@@ -1,0 +1,157 @@
+"""Joint limits of MuJoCo and Drake: their own soft ones in their own steps, and how far they are from rigid stops."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit.engines.mujoco.constraints import Softness
+from mbkit.engines.mujoco.engine import INTEGRATORS, MujocoDynamics
+from mbkit.engines.mujoco.simulation import OwnSimulation
+from mbkit.errors import DoubtfulRunWarning, InputError, UnknownNameError, UnsupportedError
+from mbkit.studies.explain.worlds import file_settings
+
+SLIDER = """<mujoco><option timestep="0.001" integrator="{integrator}" tolerance="0">
+  <flag warmstart="disable" eulerdamp="disable"/></option>
+  <worldbody><body name="block"><inertial pos="0 0 0" mass="2" diaginertia="1 1 1"/>
+    <joint name="x" type="slide" axis="0 0 1" limited="true" range="-0.5 0.4" {softness}/></body>
+  </worldbody></mujoco>"""
+SOFTNESS: dict[str, tuple[dict[str, Any], str]] = {
+    "default": ({}, ""),
+    "shorter": ({"limit_solref": (0.01, 1.0)}, 'solreflimit="0.01 1"'),
+    "direct": ({"limits": {"x": Softness((-3000.0, -40.0))}}, 'solreflimit="-3000 -40"'),
+    "harder": ({"limits": {"x": Softness(solimp=(0.99, 0.999, 1e-3, 0.5, 2))}}, 'solimplimit="0.99 0.999 0.001 0.5 2"'),
+}
+
+
+def slider(**numbers: Any) -> mb.Model:
+    """A block that falls 0.5 m onto the lower limit of its slide."""
+    b = mb.ModelBuilder("slider")
+    b.add_body("block", mass=2.0, inertia=(1.0, 1.0, 1.0))
+    axis = (0.0, 0.0, 1.0)
+    b.add_joint("x", "prismatic", parent="world", child="block", axis=axis, lower=-0.5, upper=0.4, **numbers)
+    return b.build()
+
+
+def bare(text: str, steps: int = 600) -> np.ndarray:
+    """q and v of a run of MuJoCo alone."""
+    m = mujoco.MjModel.from_xml_string(text)
+    d, rows = mujoco.MjData(m), []
+    for _ in range(steps + 1):
+        rows.append([d.qpos[0], d.qvel[0]])
+        mujoco.mj_step(m, d)
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("kind", SOFTNESS)
+def test_soft_limits_are_those_of_mj_step_bit_for_bit(kind: str, integrator: str) -> None:
+    options, softness = SOFTNESS[kind]
+    names = {"euler": "Euler", "rk4": "RK4"}
+    own = bare(SLIDER.format(integrator=names.get(integrator, integrator), softness=softness))
+    dyn = mb.dynamics(slider(), "mujoco", **({"limits": "soft"} | options))
+    assert own[:, 0].min() < -0.5
+    for x in (dyn, pickle.loads(pickle.dumps(dyn)), dyn.at()):
+        run = mb.simulate(x, [0.0], [0.0], 0.6, f"mujoco_{integrator}", 1e-3)
+        assert np.array_equal(np.hstack([run.q, run.v]), own)
+
+
+def test_accelerations_and_other_methods_have_the_soft_limits_too() -> None:
+    dyn, far = mb.dynamics(slider(), "mujoco", limits="soft"), [-0.6]
+    assert dyn.forward_dynamics([0.0], [0.0], [0.0]) == [-9.81]
+    assert dyn.forward_dynamics(far, [0.0], [0.0]) > 100
+    assert dyn.inverse_dynamics(far, [0.0], [0.0]) == [2 * 9.81]
+    for own, ours in (("mujoco_rk4", "rk4"), ("mujoco_euler", "semi_implicit_euler")):
+        a, b = (mb.simulate(dyn, [0.0], [0.0], 0.6, method, 1e-3) for method in (own, ours))
+        assert np.abs(a.q - b.q).max() < 1e-12
+        # What the limit takes is work, and no sign of a wrong run; quadrature goes across the force's jump at first
+        # order, with a power of some 2 kW over a step of 1 ms.
+        assert not a.stats.doubts
+        assert np.abs(a.power_balance()).max() < 0.2 * abs(a.energy()[-1] - a.energy()[0])
+    assert "joint limits" not in dyn.disabled
+    assert "joint limits" in mb.dynamics(slider(), "mujoco").disabled
+
+
+def test_half_of_the_time_constant_halves_the_penetration() -> None:
+    """A critically damped stop is v t exp(-t/T) deep, at most v T/e, where T = 0.95 of the time constant.
+
+    The impedance, 0.9 to 0.95, lets gravity and a tenth of the free motion through, so that the ratio is near two.
+    """
+    depths = []
+    for constant in (0.02, 0.01, 0.005):
+        dyn = mb.dynamics(slider(), "mujoco", limits="soft", limit_solref=(constant, 1.0))
+        depths.append(-0.5 - mb.simulate(dyn, [0.0], [0.0], 0.6, "mujoco_rk4", 1e-4).q.min())
+        assert 0.9 < depths[-1] / (np.sqrt(2 * 9.81 * 0.5) * 0.95 * constant / np.e) < 1.2
+    assert np.allclose([depths[0] / depths[1], depths[1] / depths[2]], 2.0, atol=0.1)
+
+
+def test_a_loop_beside_limits_keeps_its_written_law() -> None:
+    model = mb.catalog.slider_crank()
+    joints = [replace(j, lower=np.array([-0.1]), upper=np.array([0.1])) for j in model.joints[:1]]
+    limited = replace(model, joints=(*joints, *model.joints[1:]))
+    free, dyn = mb.dynamics(model, "mujoco"), mb.dynamics(limited, "mujoco", limits="soft")
+    q, v = free.project([0.5, -0.2, -0.1], [1.0, 0.0, 0.0])
+    tau = np.zeros(3)
+    assert np.abs(free.constraint_law(q, v, tau).acceleration - dyn.constraint_law(q, v, tau).acceleration).max() < 1e-9
+    assert np.abs(free.forward_dynamics(q, v, tau) - dyn.forward_dynamics(q, v, tau)).max() > 1.0
+    with pytest.warns(DoubtfulRunWarning, match="two steps"):
+        mb.simulate(dyn, q, v, 0.1, "mujoco_rk4", 0.05)
+
+
+def test_drake_s_discrete_plant_has_its_own_nearly_rigid_limits() -> None:
+    dyn = mb.dynamics(slider(), "drake", limits="soft")
+    for x in (dyn, pickle.loads(pickle.dumps(dyn)), dyn.at()):
+        run = mb.simulate(x, [0.0], [0.0], 0.6, "drake_sap", 1e-3)
+        assert -1e-6 < run.q.min() + 0.5 < 1e-6
+    assert mb.simulate(mb.dynamics(slider(), "drake"), [0.0], [0.0], 0.6, "drake_sap", 1e-3).q.min() < -1.5
+    for method in ("rk4", "drake_runge_kutta3"):
+        with pytest.raises(UnsupportedError, match="discrete plant alone; method='drake_sap' runs it"):
+            mb.simulate(dyn, [0.0], [0.0], 0.1, method, save=[0.0, 0.1])
+
+
+def test_what_soft_limits_do_not_go_with_is_refused_by_name() -> None:
+    with pytest.raises(InputError, match="limits: expected 'soft' or None, got 'hard'"):
+        mb.dynamics(slider(), "mujoco", limits="hard")
+    with pytest.raises(InputError, match="limit_solref: is of soft limits"):
+        mb.dynamics(slider(), "mujoco", limit_solref=(0.01, 1.0))
+    with pytest.raises(UnknownNameError, match="joint with limits"):
+        mb.dynamics(slider(), "mujoco", limits={"y": Softness()})
+    with pytest.raises(InputError, match="two positive or two negative"):
+        mb.dynamics(slider(), "mujoco", limits="soft", limit_solref=(0.01, -1.0))
+    with pytest.raises(UnsupportedError, match="exact friction of slider; give soft_friction=True"):
+        mb.dynamics(slider(friction=1.0), "mujoco", limits="soft")
+    with pytest.raises(UnsupportedError, match="mimic joints"):
+        mb.dynamics(mb.load("tiago_pro"), "mujoco", limits="soft", soft_friction=True)
+    with pytest.raises(InputError, match="limits: pinocchio has no such option"):
+        mb.dynamics(slider(), "pinocchio", limits="soft")
+    both = mb.dynamics(slider(friction=1.0), "mujoco", limits="soft", soft_friction=True)
+    assert mb.simulate(both, [0.0], [0.0], 0.6, "mujoco_rk4", 1e-3).q.min() < -0.5
+
+
+def test_softness_of_a_file_s_limits_is_a_setting_of_its_runs(tmp_path: Path) -> None:
+    path, text = tmp_path / "a.xml", SLIDER.format(integrator="RK4", softness='solreflimit="0.005 1"')
+    path.write_text(text.replace(' tolerance="0"', "").replace('warmstart="disable"', ""))
+    model = mb.load(path)
+    held, left = file_settings(path, model)
+    assert held is not None
+    assert not left
+    assert held.limit_softness == (("x", (0.005, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)),)
+    dyn = mb.dynamics(model, "mujoco", limits="soft")
+    assert isinstance(dyn, MujocoDynamics)
+    assert dyn.limit_softness == {"x": Softness((0.005, 1.0))}
+    _, q, _ = OwnSimulation(model, held).run(np.zeros(1), np.zeros(1), None, 0.6)
+    assert np.array_equal(q[:, 0], bare(path.read_text(), len(q) - 1)[:, 0])
+    assert (
+        np.abs(
+            q.min()
+            - OwnSimulation(model, replace(held, limit_softness=())).run(np.zeros(1), np.zeros(1), None, 0.6)[1].min()
+        )
+        > 1e-3
+    )
