@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -155,3 +156,102 @@ def test_softness_of_a_file_s_limits_is_a_setting_of_its_runs(tmp_path: Path) ->
         )
         > 1e-3
     )
+
+
+def test_rigid_stops_give_way_to_soft_limits_and_are_refused_without_them() -> None:
+    model = slider(stops=True, restitution=0.3)
+    for engine, method in (("mujoco", "mujoco_rk4"), ("drake", "drake_sap")):
+        with pytest.raises(
+            UnsupportedError, match=rf"{method}: .*joint 'x' has stops.*limits='soft' of mujoco and drake"
+        ):
+            mb.simulate(mb.dynamics(model, engine), [0.0], [0.0], 0.1, method, 1e-3)
+        soft, plain = (mb.dynamics(m, engine, limits="soft") for m in (model, slider()))
+        assert not soft.model.needs.stops
+        a, b = (mb.simulate(d, [0.0], [0.0], 0.6, method, 1e-3) for d in (soft, plain))
+        assert np.array_equal(a.q, b.q)
+    with pytest.raises(UnsupportedError, match="joint 'x' has stops"):
+        mb.dynamics(model, "mujoco").rollout("rk4", [0.0], [0.0], 1e-3, None, 10)  # type: ignore[attr-defined]
+    with pytest.raises(UnsupportedError, match="joint 'x' has stops"):
+        mb.dynamics(model, "mujoco", soft_friction=True)
+
+
+# The study
+
+
+def test_a_soft_limit_beside_the_rigid_stop_as_closed_forms_have_it() -> None:
+    """The block falls for √(2 h/g); a critically damped limit lets it go two time constants later."""
+    found = mb.soft_stops(slider(), [0.0], dt=1e-4)
+    usual, half = found.rows
+    assert (usual.softness, half.softness) == ("solref (0.02, 1)", "solref (0.01, 1)")
+    assert {r.limit for r in found.rows} == {"x lower"}
+    fall = np.sqrt(2 * 0.5 / 9.81)
+    for r in found.rows:
+        assert np.allclose([r.arrives, r.arrives_rigid], fall, rtol=0, atol=2e-7)
+        assert np.isclose(r.lost_rigid, 2 * 9.81 * 0.5, rtol=1e-9)
+        assert np.isnan(r.leaves_rigid)
+        assert r.turned == 0.0
+        # What the block has lost in the end is its whole fall, down into the limit.
+        assert 0 < r.lost - r.lost_rigid < 2 * 9.81 * r.penetration
+        # It is farthest from the rigid one where it is deepest.
+        assert np.isclose(r.moved, r.penetration, rtol=1e-6)
+    assert np.isclose(usual.penetration / half.penetration, 2.0, atol=0.1)
+    assert half.leaves > fall + 2 * 0.95 * 0.01
+    assert found.verdict.startswith(
+        "mujoco with solref (0.02, 1) passes x lower by 2.3e-02, and within 1.00 s is 0 rad"
+    )
+
+
+def test_a_result_goes_through_json_and_shows_its_sentence_first() -> None:
+    found = mb.soft_stops(slider(), [0.0], duration=0.5)
+    back = type(found).from_json(found.to_json())
+    assert back.to_json() == found.to_json()
+    assert back.rows[0].penetration == found.rows[0].penetration
+    assert found.to_markdown().startswith("**slider**: mujoco with solref")
+    assert found._repr_html_().startswith("<p><b>slider</b>: mujoco with solref")
+    assert found.to_csv().count("\n") == 3
+
+
+def test_a_start_is_found_whose_motion_reaches_a_limit() -> None:
+    model = mb.catalog.double_pendulum()
+    with pytest.raises(InputError, match="expected joints with limits, double_pendulum has none"):
+        mb.soft_stops(model)
+    limited = replace(
+        model, joints=tuple(replace(j, lower=np.array([-1.0]), upper=np.array([1.2])) for j in model.joints)
+    )
+    found = mb.soft_stops(limited, duration=0.8)
+    assert found.rows
+    assert all(r.penetration > 0 and np.isclose(r.arrives, r.arrives_rigid, atol=0.05) for r in found.rows[:1])
+    assert found.rows[0].turned > 0.0 == found.rows[0].moved
+    assert mb.soft_stops(limited, [0.1, 0.0], duration=0.1).verdict == "no joint reaches a limit within 100 ms"
+    drake = mb.soft_stops(limited, found.q0, found.v0, duration=0.8, engine="drake")
+    assert drake.rows[0].penetration < 1e-3 * found.rows[0].penetration
+    assert drake.rows[0].softness == "steps of 1.00 ms"
+    with pytest.raises(InputError, match="pinocchio has no such option"):
+        mb.soft_stops(limited, engine="pinocchio")
+
+
+@pytest.mark.filterwarnings("ignore::mbkit.errors.MbkitWarning")
+def test_a_comparison_tells_what_limits_do_to_motions() -> None:
+    model = mb.catalog.pendulum()
+    limited = replace(
+        model, joints=tuple(replace(j, lower=np.array([-0.5]), upper=np.array([0.4])) for j in model.joints)
+    )
+    (limits,) = (x for x in mb.compare(limited, samples=2).findings if x.kind == "limits")
+    reached = re.fullmatch(
+        r"off here in every engine: limits at 1 joint; (\d+) of 16 motions of 1 s from random states within them reach "
+        r"one, theta first, after (\S+) s; rigid stops move that one by (\S+) rad or m in 1 s",
+        limits.says,
+    )
+    assert reached
+    # By the same starts, step by step of a textbook's formula.
+    q, v = limited.random_state(np.random.default_rng([0, 3]), size=16)
+    dyn = mb.dynamics(model, "lagrangian")
+    runs = [mb.simulate(dyn, *s, 1.0, save=np.linspace(0.0, 1.0, 1001)) for s in zip(q, v, strict=True)]
+    beyond = [(x.q[:, 0] < -0.5) | (x.q[:, 0] > 0.4) for x in runs]
+    assert int(reached[1]) == sum(x.any() for x in beyond) > 0
+    assert np.isclose(
+        float(reached[2]), min(x.t[np.argmax(b)] for x, b in zip(runs, beyond, strict=True) if b.any()), rtol=0.05
+    )
+    assert 0.01 < float(reached[3]) < 10
+    (bare,) = (x for x in mb.compare(limited, samples=2, terms_only=True).findings if x.kind == "limits")
+    assert bare.says == "off here in every engine: limits at 1 joint"

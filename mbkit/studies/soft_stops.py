@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Final
@@ -19,7 +18,7 @@ from mbkit.simulate import Trajectory
 from mbkit.studies import document as doc
 from mbkit.studies._targets import with_values
 from mbkit.studies.formatting import error_text, time_text
-from mbkit.studies.results import ResultTable, columns_of, provenance
+from mbkit.studies.results import ResultTable, columns_of, versions
 from mbkit.studies.study_runs import integrable, quiet_simulate, require_motion, runs_to_limits
 
 
@@ -67,8 +66,6 @@ class SoftStops(ResultTable):
     rows: tuple[SoftStop, ...]
     notes: tuple[str, ...] = ()
     versions: dict[str, str] = field(default_factory=dict)
-    processor: str = ""
-    seconds: float = 0.0
 
     _derived: ClassVar = ("verdict",)
     _csv_columns: ClassVar = columns_of(SoftStop)
@@ -115,7 +112,7 @@ def soft_stops(
         s; `dt` is the engine's step.
     engine : {"mujoco", "drake"}
     """
-    begun, model = time.perf_counter(), with_values(require_motion(model, "stop"), "soft_stops")
+    model = with_values(require_motion(model, "stop"), "soft_stops")
     bare, notes = integrable(model.without("stops"))
     soft, smooth = dynamics(bare, engine, limits="soft"), dynamics(bare, DERIVED)
     if not soft._soft_limits:
@@ -131,7 +128,7 @@ def soft_stops(
     rigid = quiet_simulate(dynamics(bare.with_stops(), DERIVED), *start, duration, ADAPTIVE_METHOD, save=grid)
     rows = tuple(row for text, run in runs.items() for row in _rows(text, run, rigid, smooth))
     q, v = (tuple(x.tolist()) for x in start)
-    return SoftStops(model.name, engine, method, dt, duration, q, v, rows, tuple(notes), **provenance(begun))
+    return SoftStops(model.name, engine, method, dt, duration, q, v, rows, tuple(notes), versions())
 
 
 def _softer(soft: Any, dt: float) -> Iterator[tuple[str, Any, float]]:

@@ -22,7 +22,7 @@ import numpy as np
 from mbkit._check import EPS, Array, by_key
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.registry import DERIVED, MUJOCO, PINOCCHIO, find_engine
-from mbkit.methods.registry import DEFAULT_METHOD, EULER_METHOD, METHODS
+from mbkit.methods.registry import ADAPTIVE_METHOD, DEFAULT_METHOD, EULER_METHOD, METHODS
 from mbkit.model import Model
 from mbkit.model.description import LEFT_OUT, SERVOS
 from mbkit.model.elements.kinds import EFFECTS, PART_KINDS, kind, that_do
@@ -83,19 +83,21 @@ def _limits(model: Model) -> Finding | None:
 
 
 def reached_limits(model: Model, engines: Mapping[str, Dynamics], seed: int) -> str:
-    """Return how many free motions reach a limit, which first, and by how much stops change that motion's end."""
-    dyn = engines[next(x for x in (DERIVED, MUJOCO, *engines) if x in engines)]
-    run, reached = runs_to_limits(dyn, DURATION, seed)
+    """Return how many free motions reach a limit, which first, and how far rigid stops move that one; "" if unknown."""
+    moving, stopping = (next(x for x in (own, *engines) if x in engines) for own in (DERIVED, PINOCCHIO))
+    run, reached = runs_to_limits(engines[moving], DURATION, seed)
+    if not np.isfinite(run.q).all() or run.t[-1] < DURATION:
+        # Too stiff for the step.
+        return ""
     says = f"{len(reached)} of {len(run.q)} motions of {DURATION:g} s from random states within them reach one"
-    if not reached:
-        return says
-    t, i, k = reached[0]
-    stopping = dynamics(model.with_stops(), dyn.engine, **find_engine(dyn.engine).brief)
-    stopped = quiet_simulate(stopping, run.q[i, 0], run.v[i, 0], DURATION, rtol=_STOPPED)
-    off = np.abs(model.difference(run.q[i, -1], stopped.q[-1])).max()
-    return (
-        f"{says}, {model.coordinate_names[k]} first, after {t:.2g} s, whose end rigid stops move by {off:.2g} rad or m"
-    )
+    for t, i, k in reached[:1]:
+        dyn = dynamics(model.with_stops(), stopping, **find_engine(stopping).brief)
+        stopped = quiet_simulate(dyn, run.q[i, 0], run.v[i, 0], DURATION, ADAPTIVE_METHOD, rtol=_STOPPED)
+        end = min(int(np.searchsorted(run.t, stopped.t[-1])), len(run.t) - 1)
+        off = np.abs(model.difference(run.q[i, end], stopped.q[-1])).max()
+        says += f", {model.coordinate_names[k]} first, after {t:.2g} s; rigid stops move that one by {off:.2g}"
+        says += f" rad or m in {run.t[end]:.2g} s"
+    return says
 
 
 def stiff_joints(model: Model, M: Array, J: Array | None = None, step: float = STEP) -> list[Finding]:

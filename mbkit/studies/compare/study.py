@@ -30,7 +30,7 @@ from mbkit.model import Model
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.studies import results
 from mbkit.studies._targets import engine_names, with_values
-from mbkit.studies.compare.beyond_terms import findings, omissions, rollouts
+from mbkit.studies.compare.beyond_terms import findings, omissions, reached_limits, rollouts
 from mbkit.studies.compare.body_terms import BODY_TERMS, MECHANISM_TERMS, BodyScales
 from mbkit.studies.compare.errors import (
     ROUNDINGS,
@@ -45,6 +45,7 @@ from mbkit.studies.compare.terms import (
     CONSTRAINT_TERMS,
     FORWARD_DYNAMICS,
     JOINT_LOADS,
+    LIMITS,
     OF_CONSTRAINED_MOTION,
     OWN_LAW,
     POWER,
@@ -418,7 +419,10 @@ def compare(
             checkpoint(out)
         beyond, refused = _beyond_terms(model, built, seed, tell)
         seconds = time.perf_counter() - begun
-        out = replace(out, refusals=(*out.refusals, *refused), seconds=seconds, **beyond)
+        reached, told = beyond.pop("limits", ""), out.findings
+        if reached:
+            told = tuple(replace(x, says=f"{x.says}; {reached}") if x.kind == LIMITS else x for x in told)
+        out = replace(out, refusals=(*out.refusals, *refused), seconds=seconds, findings=told, **beyond)
     tell(1.0, "done")
     return out
 
@@ -443,6 +447,8 @@ def _beyond_terms(
         (0.42, "rollouts", "rollouts", partial(rollouts, moving, movers, seed, "; ".join(notes))),
         (0.6, "precision", "error against run time", by_time),
     ]
+    if "joint.limit" in moving.acts:
+        studies.append((0.5, "limits", "motions to limits", partial(reached_limits, moving, movers, seed)))
     if model.has_bodies:
         studies.append((0.9, "omissions", "what was left out", partial(omissions, model, engines, seed)))
     result: dict[str, Any] = {}
