@@ -313,6 +313,11 @@ class Joint(_Frozen):
         """Whether its friction at rest may be above that of motion."""
         return self.stiction is not None and bool((self.stiction > self.friction).any())
 
+    @property
+    def stops(self) -> bool:
+        """Whether its limits act as rigid stops."""
+        return self.restitution is not None
+
     @classmethod
     def _of(
         cls, name: str, kind: str, parent: str, child: str, rotation: Array, translation: Array, **own: Any

@@ -176,7 +176,8 @@ class Watch:
             # The two samples in between differ by this from the parabola through the ends and the middle.
             bend = max(abs(3 * a + 6 * x[2] - b - 8 * c) / 8 for a, b, c in ((x[0], x[4], x[1]), (x[4], x[0], x[3])))
             room = part[4][0] - part[0][0] > 1e-9 * (last[0] - first[0])
-            if room and bend > max(min(x) / 2, _MAX_PARABOLA_ERROR * size):
+            dips = _lowest(x) - bend < -event.noise * size <= min(x)
+            if room and (dips or bend > max(min(x) / 2, _MAX_PARABOLA_ERROR * size)):
                 middles = [(a[0] + b[0]) / 2 for a, b in pairwise(part)]
                 finer = sorted([*part, *((t, self._value(event, t, state(t))) for t in middles)])
                 parts += [finer[4:], finer[:5]]
@@ -200,6 +201,13 @@ class Watch:
             return known[t] if t in known else self._value(event, t, state(t))
 
         return float(brentq(value, first[0], last[0], xtol=xtol, rtol=4 * EPS))
+
+
+def _lowest(x: Sequence[float]) -> float:
+    """Return the least value of the parabola through the first, third and fifth of five samples, infinite at ends."""
+    slope, curve = x[4] - x[0], x[4] - 2 * x[2] + x[0]
+    inside = curve > 0 and abs(slope) < 2 * curve
+    return x[2] - slope**2 / (8 * curve) if inside else np.inf
 
 
 def as_events(events: object) -> tuple[Event, ...]:

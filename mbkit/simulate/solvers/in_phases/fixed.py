@@ -139,7 +139,7 @@ class _Members:
         for x in impacts:
             row, when = int(rows[x.row]), float(t[x.row])
             member = None if self.problem.batch is None else int(self.members[row])
-            self._record.events.append(x.event(when, self.q[row].copy(), self.v[row].copy(), member))
+            self._record.events.append(x.event(when, self.q[row].copy(), member))
 
     # Forces
 

@@ -200,8 +200,10 @@ class Impact(NamedTuple):
         Of the event.
     delay : float
         s from the impact to the event.
+    after : (nv,) array
+        The velocities after it.
     before : (nv,) array or None
-        The velocities before it, with the first of several at one time.
+        Those before it, with the first of several at one time.
     energy_change : float
         J.
     """
@@ -210,12 +212,13 @@ class Impact(NamedTuple):
     velocity: int
     name: str
     delay: float
+    after: Array
     before: Array | None = None
     energy_change: float = 0.0
 
-    def event(self, t: float, q: Array, v: Array, member: int | None) -> Hit:
+    def event(self, t: float, q: Array, member: int | None) -> Hit:
         """Return the event of a run."""
-        return Hit(self.name, t + self.delay, q, v, member, self.before, self.energy_change)
+        return Hit(self.name, t + self.delay, q, self.after.copy(), member, self.before, self.energy_change)
 
 
 class Phases:
@@ -462,7 +465,8 @@ class Phases:
         bounces = side * new > 0
         if bounces.any():
             a = own.forward_dynamics(states, new, _rows(applied(force, t, q, out))[rows])
-            size = np.maximum(1.0, np.abs(np.where(side > 0, *self._stops.bounds)))
+            bound = np.where(side > 0, self._stops.bounds[0], np.where(side < 0, self._stops.bounds[1], 0.0))
+            size = np.maximum(1.0, np.abs(bound))
             ends = bounces & (side * a < 0) & (new**2 <= 2 * np.abs(a) * FLAT * size)
             if ends.any():
                 delays = np.where(
@@ -472,13 +476,15 @@ class Phases:
         _rows(leaving)[rows] = 0.0
         for k in np.flatnonzero(hits.any(axis=1)).tolist():
             told: Array | None = before[k]
+            # Of a stop that was not hit, and has a part in the impact, the first event tells.
+            others = float(np.where(hits[k], 0.0, taken[k]).sum())
             for i in np.flatnonzero(hits[k]).tolist():
-                name = partial(self._stops.event, i, side[k, i])
-                impacts.append(Impact(int(rows[k]), i, name("hits"), 0.0, told, float(taken[k, i])))
-                told = None
+                name, row = partial(self._stops.event, i, side[k, i]), int(rows[k])
+                impacts.append(Impact(row, i, name("hits"), 0.0, new[k], told, float(taken[k, i]) + others))
+                told, others = None, 0.0
                 if ends[k, i] and e[k, i]:
-                    last = float(delays[k, i]), None, float(left[k, i])
-                    impacts.append(Impact(int(rows[k]), i, name("comes to rest on"), *last))
+                    last = float(delays[k, i]), _rows(out)[row], None, float(left[k, i])
+                    impacts.append(Impact(row, i, name("comes to rest on"), *last))
         return out, leaving, impacts
 
     def stopped(self, dyn: Dynamics, t: float | Array, q: Array, v: Array, rests: Mask) -> Array:

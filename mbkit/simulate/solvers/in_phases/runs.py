@@ -56,7 +56,7 @@ class _Friction:
         """Return the phase with which the run begins."""
         phases, force = self._phases, self._force(0)
         v, _, impacts = phases.hit(phases.dyn, t, q, phases.stopped(phases.dyn, t, q, v, v == 0), force)
-        begins = [x.event(t, q, v, self._member) for x in impacts]
+        begins = [x.event(t, q, self._member) for x in impacts]
         return self._stretch(phases.phase(t, q, v, force), t, q, v, begins)
 
     def _follow(self, phase: Phase, hit: Hit | None, t: float, q: Array, v: Array, moved: bool) -> Stretch | None:
@@ -66,7 +66,7 @@ class _Friction:
         q, v, leaving, impacts = phases.after(phase, t, q, v, force)
         # A joint that let go and came to rest at once did not let go.
         new = phases.phase(t, q, v, force, leaving if moved else None)
-        changes = [x.event(t, q, v, self._member) for x in impacts]
+        changes = [x.event(t, q, self._member) for x in impacts]
         changes += [Hit(name, t, q, v, self._member) for _, name in phases.changes(phase, new, q, impacts)]
         return self._stretch(new, t, q, v, changes)
 
