@@ -473,6 +473,8 @@ class Phases:
                     ends & hits & (e < 1), 2 * np.abs(new) / np.where(ends, np.abs(a) * (1 - e), 1.0), 0.0
                 )
                 _rows(out)[rows], _, left = over(self._own, own, states, new, ends)
+        # What rows hold together with a stop rests too.
+        out = self.stopped(rubbed, t, q, out, out == 0)
         _rows(leaving)[rows] = 0.0
         for k in np.flatnonzero(hits.any(axis=1)).tolist():
             told: Array | None = before[k]
