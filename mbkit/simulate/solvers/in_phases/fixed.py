@@ -573,28 +573,37 @@ class _PartOfStep:
             return self._margins(i[k], low[k] + x * (high - low)[k]) / unit[k]
 
         if len(open_):
-            found = first_zero(margins, before[open_], after[open_])
+            q, v = (x[self._rows[i[open_]]] for x in (self._run.q, self._run.v))
+            slope = self._run.phases.approach(q, v) * (high - low)[open_, None] / unit[open_]
+            found = first_zero(margins, before[open_], after[open_], slope)
             out[open_] = low[open_] + found * (high - low)[open_]
         return out, faded
 
 
-def first_zero(function: Callable[[Array, Indices], Array], before: Array, after: Array) -> Array:
+def first_zero(
+    function: Callable[[Array, Indices], Array], before: Array, after: Array, slope: Array | float = np.nan
+) -> Array:
     """Return where the first of some smooth functions falls to zero between 0 and 1, to ±1 or its noise, (m,).
 
     function(x, rows) has the values at x, (n, k). They are all positive `before`, at 0, and one is not `after`, at 1,
     (m, k) each. The least of them has a kink where another one becomes it. So the function whose chord falls first is
-    interpolated, by the inverse parabola through three places or the chord, with bisection where that is slow.
+    interpolated, by the inverse parabola through three places or the chord, with bisection where that is slow. First it is
+    the parabola with a `slope` at 0, where that is finite: what bounces off rises before it falls.
     """
     m, going = len(before), np.arange(len(before))
     # Places above and below zero, and the last one that was replaced.
     x, f = np.array([[0.0], [1.0], [np.nan]]) + np.zeros(m), np.array([before, after, np.full(before.shape, np.nan)])
     out, slow, best = np.ones(m), np.zeros(m, dtype=int), np.full(m, np.inf)
-    for _ in range(_MAX_ROUNDS):
+    for count in range(_MAX_ROUNDS):
         if not len(going):
             break
         (low, high, old), (above, below, other), rows = x[:, going], f[:, going], np.arange(len(going))
         with np.errstate(divide="ignore", invalid="ignore"):
             chords = np.where(below < 0, above / (above - below), np.inf)
+            if not count:
+                bend = above + slope - below
+                parabola = (slope + np.sqrt(slope**2 + 4 * bend * above)) / (2 * bend)
+                chords = np.where((below < 0) & (0 < parabola) & (parabola < 1), parabola, chords)
             j = chords.argmin(axis=1)
             a, b, c = above[rows, j], below[rows, j], other[rows, j]
             parts = low * b * c / (a - b) / (a - c), high * a * c / (b - a) / (b - c), old * a * b / (c - a) / (c - b)

@@ -342,6 +342,14 @@ class Phases:
                 out = np.where(still & ~phase.locked[..., self.which], np.minimum(out, 1 - moved[..., self.which]), out)
         return out
 
+    def approach(self, q: Array, v: Array) -> Array:
+        """Return the rates of the distances from the nearest stops, (m, k); NaN without one."""
+        if not self._stops:
+            return np.full((len(v), len(self.which)), np.nan)
+        low, high = np.moveaxis(self._stops.distance(q), -2, 0)
+        rate = np.where(self._stops.which, np.where(low <= high, v, -v), np.nan)
+        return np.asarray(rate[:, self.which])
+
     def _pushed(self, phase: Phase, q: Array) -> Array:
         """Return 1 and -1 for what rests on lower and upper stops, of the shape of v."""
         return np.where(phase.still, self._stops.against(q), 0.0)
