@@ -587,8 +587,8 @@ def first_zero(
 
     function(x, rows) has the values at x, (n, k). They are all positive `before`, at 0, and one is not `after`, at 1,
     (m, k) each. The least of them has a kink where another one becomes it. So the function whose chord falls first is
-    interpolated, by the inverse parabola through three places or the chord, with bisection where that is slow. First it is
-    the parabola with a `slope` at 0, where that is finite: what bounces off rises before it falls.
+    interpolated, by the inverse parabola through three places or the chord, with bisection where that is slow. The first
+    guess is on the parabola with a `slope` at 0, where that is finite: what bounces off rises before it falls.
     """
     m, going = len(before), np.arange(len(before))
     # Places above and below zero, and the last one that was replaced.
@@ -603,7 +603,7 @@ def first_zero(
             if not count:
                 bend = above + slope - below
                 parabola = (slope + np.sqrt(slope**2 + 4 * bend * above)) / (2 * bend)
-                chords = np.where((below < 0) & (0 < parabola) & (parabola < 1), parabola, chords)
+                chords = np.where((below < 0) & (parabola > 0) & (parabola < 1), parabola, chords)
             j = chords.argmin(axis=1)
             a, b, c = above[rows, j], below[rows, j], other[rows, j]
             parts = low * b * c / (a - b) / (a - c), high * a * c / (b - a) / (b - c), old * a * b / (c - a) / (c - b)
