@@ -587,8 +587,8 @@ def first_zero(
 
     function(x, rows) has the values at x, (n, k). They are all positive `before`, at 0, and one is not `after`, at 1,
     (m, k) each. The least of them has a kink where another one becomes it. So the function whose chord falls first is
-    interpolated, by the inverse parabola through three places or the chord, with bisection where that is slow. The first
-    guess is on the parabola with a `slope` at 0, where that is finite: what bounces off rises before it falls.
+    interpolated, by the inverse parabola through three places or the chord, with bisection where that is slow. The
+    first guess is on the parabola with a `slope` at 0, where that is finite: what bounces off rises before it falls.
     """
     m, going = len(before), np.arange(len(before))
     # Places above and below zero, and the last one that was replaced.
