@@ -54,7 +54,10 @@ _UNITS: Final = "Angles are in rad, lengths in m, times in s, energies in J; rig
 
 @dataclass(frozen=True, repr=False)
 class SoftStops(ResultTable):
-    """Limits of an engine's own beside rigid stops, from one start; a row for each that is reached."""
+    """Limits of an engine's own beside rigid stops, from one start; a row for each that is reached.
+
+    `notes` are what both motions are without, `doubts` signs that one of them is wrong.
+    """
 
     model: str
     engine: str
@@ -65,6 +68,7 @@ class SoftStops(ResultTable):
     v0: tuple[float, ...]
     rows: tuple[SoftStop, ...]
     notes: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
     versions: dict[str, str] = field(default_factory=dict)
 
     _derived: ClassVar = ("verdict",)
@@ -78,12 +82,13 @@ class SoftStops(ResultTable):
         r = self.rows[0]
         off = f"{error_text(r.turned)} rad and {error_text(r.moved)} m off rigid stops"
         passed = f"passes {r.limit} by {error_text(r.penetration)}"
-        return f"{self.engine} with {r.softness} {passed}, and within {time_text(self.duration)} is {off}"
+        who = f"{'in doubt: ' * bool(self.doubts)}{self.engine} with {r.softness}"
+        return f"{who} {passed}, and within {time_text(self.duration)} is {off}"
 
     def document(self) -> doc.Document:
         """Return the document: the verdict, then the limits."""
         start = f"{self.method} at {time_text(self.dt)} from q0 = {self.q0}, v0 = {self.v0}"
-        below = doc.Items([doc.Bullet("", x) for x in (start, *self.notes, _UNITS)])
+        below = doc.Items([doc.Bullet("", x) for x in (*self.doubts, start, *self.notes, _UNITS)])
         section = doc.Section("Limits that are reached", [doc.Table(_COLUMNS, self.rows), below])
         return doc.Document(self.model, self.verdict, good=True, marked=False, sections=[section], result=self)
 
@@ -127,8 +132,10 @@ def soft_stops(
     grid = max((run.t for run in runs.values()), key=len)
     rigid = quiet_simulate(dynamics(bare.with_stops(), DERIVED), *start, duration, ADAPTIVE_METHOD, save=grid)
     rows = tuple(row for text, run in runs.items() for row in _rows(text, run, rigid, smooth))
+    signs = {text: (run.stats.message, *run.stats.doubts) for text, run in (*runs.items(), ("rigid", rigid))}
+    doubts = tuple(f"{text}: {x}" for text, told in signs.items() for x in told if x)
     q, v = (tuple(x.tolist()) for x in start)
-    return SoftStops(model.name, engine, method, dt, duration, q, v, rows, tuple(notes), versions())
+    return SoftStops(model.name, engine, method, dt, duration, q, v, rows, tuple(notes), doubts, versions())
 
 
 def _softer(soft: Any, dt: float) -> Iterator[tuple[str, Any, float]]:

@@ -170,10 +170,7 @@ def start_state(model: Model, seed: int) -> tuple[Array, Array]:
 
 
 def runs_to_limits(dyn: Dynamics, duration: float, seed: int) -> tuple[Trajectory, list[tuple[float, int, int]]]:
-    """Return free runs from random states within the limits, and time, run and coordinate of the first limits reached.
-
-    The earliest is the first, each run has one at most.
-    """
+    """Return free runs from random states within the limits; and time, run and coordinate of each one's first limit."""
     model = dyn.model
     start = model.random_state(np.random.default_rng([seed, 3]), size=_RUNS_TO_LIMITS)
     run = quiet_simulate(dyn, *start, duration, find_engine(dyn.engine).rk4, dt=1e-3)

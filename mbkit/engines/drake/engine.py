@@ -210,9 +210,6 @@ _WITHOUT_LOOPS: Final = {
 }
 
 
-_OF_LIMITS: Final = f"limits='soft' of {{model}} act in Drake's discrete plant alone; method={SAP!r} runs it"
-
-
 class DrakeDynamics(DrakeBodies, MappedDynamics):
     """Drake on a description.
 
@@ -245,7 +242,8 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
             vars(self)["_refuses"] = self._refuses | {k: why.format(**parts) for k, why in _WITHOUT_LOOPS.items()}
         if limited:
             self._soft_limits = True
-            vars(self)["_refuses"] = self._refuses | {"forward_dynamics": _OF_LIMITS.format(model=model.name)}
+            why = f"limits='soft' of {model.name} act in Drake's discrete plant alone; method={SAP!r} runs it"
+            vars(self)["_refuses"] = self._refuses | {"forward_dynamics": why}
         self._hold(build(model))
 
     def __reduce__(self) -> tuple[Any, ...]:

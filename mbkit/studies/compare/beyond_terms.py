@@ -79,24 +79,24 @@ def _limits(model: Model) -> Finding | None:
     if not parts:
         return None
     every = tuple(dict.fromkeys(name for some in alike for name in some))
-    return Finding(LIMITS, f"off here in every engine: {'; '.join(parts)}", every)
+    off = "stops in terms, and off in runs" if model.needs.stops else "off here in every engine"
+    return Finding(LIMITS, f"{off}: {'; '.join(parts)}", every)
 
 
 def reached_limits(model: Model, engines: Mapping[str, Dynamics], seed: int) -> str:
     """Return how many free motions reach a limit, which first, and how far rigid stops move that one; "" if unknown."""
     moving, stopping = (next(x for x in (own, *engines) if x in engines) for own in (DERIVED, PINOCCHIO))
     run, reached = runs_to_limits(engines[moving], DURATION, seed)
+    # Motions may be too fast for the step.
     if not np.isfinite(run.q).all() or run.t[-1] < DURATION:
-        # Too stiff for the step.
         return ""
-    says = f"{len(reached)} of {len(run.q)} motions of {DURATION:g} s from random states within them reach one"
+    says = f"; {len(reached)} of {len(run.q)} motions of {DURATION:g} s from random states within them reach one"
     for t, i, k in reached[:1]:
         dyn = dynamics(model.with_stops(), stopping, **find_engine(stopping).brief)
         stopped = quiet_simulate(dyn, run.q[i, 0], run.v[i, 0], DURATION, ADAPTIVE_METHOD, rtol=_STOPPED)
         end = min(int(np.searchsorted(run.t, stopped.t[-1])), len(run.t) - 1)
         off = np.abs(model.difference(run.q[i, end], stopped.q[-1])).max()
-        says += f", {model.coordinate_names[k]} first, after {t:.2g} s; rigid stops move that one by {off:.2g}"
-        says += f" rad or m in {run.t[end]:.2g} s"
+        says += f", {model.coordinate_names[k]} first, after {t:.2g} s; rigid stops move that one by {off:.2g} rad or m"
     return says
 
 

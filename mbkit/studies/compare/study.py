@@ -419,9 +419,8 @@ def compare(
             checkpoint(out)
         beyond, refused = _beyond_terms(model, built, seed, tell)
         seconds = time.perf_counter() - begun
-        reached, told = beyond.pop("limits", ""), out.findings
-        if reached:
-            told = tuple(replace(x, says=f"{x.says}; {reached}") if x.kind == LIMITS else x for x in told)
+        reached = beyond.pop("limits", "")
+        told = tuple(replace(x, says=x.says + reached) if x.kind == LIMITS else x for x in out.findings)
         out = replace(out, refusals=(*out.refusals, *refused), seconds=seconds, findings=told, **beyond)
     tell(1.0, "done")
     return out
