@@ -23,6 +23,7 @@ from mbkit.model.loops import LOOP_KINDS, ROLLING_KINDS, LoopKind, RollingKind
 from mbkit.model.model import Model, unchecked
 from mbkit.model.parameters import Binding, Expression, Number, nominal, split
 from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, NoSlip, NumberRule, PointSpring, rules_of
+from mbkit.model.stops import stop_faults
 from mbkit.model.validation import body_faults, fault_sentences, static_bodies, structure_faults, suspects
 
 # The squares of sums of such lengths still fit a double.
@@ -665,6 +666,7 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
         if not faults:
             # Mimic joints without leaders, and joints that move nothing, are for a connected tree only.
             model = self._assemble(*_resolve(joints, self._bindings))
+            faults = [*stop_faults(model)]
             inconsistent = suspects(model, point_masses=point_masses)
         # Bodies that a model was used with already stay used.
         known = {n for n, _ in inconsistent} & self._odd

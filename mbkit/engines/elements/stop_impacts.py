@@ -16,14 +16,15 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mbkit._check import EPS, Array
+from mbkit._check import Array
 from mbkit.engines.elements.jumps import Jumps, Mask, jump_forces
-from mbkit.methods.exchanges import restricted
+from mbkit.methods.exchanges import FORCE_ROUNDING, restricted
 
 #: Impacts in a row at one time after which no stop rebounds any more.
 _MAX_IMPACTS: Final = 200
-#: Velocity outwards that is rounding, relative to the largest velocity.
-_STILL: Final = 64 * EPS
+#: Velocity outwards, relative to the largest one at a stop, that waits for what the larger ones send on: far from what
+#: matters, and far above rounding, so that rounding joins no impacts.
+_FIRST: Final = 1e-6
 
 
 class StopImpacts(NamedTuple):
@@ -40,10 +41,12 @@ def after_impacts(jumps: Jumps, dyn: Any, q: Array, v: Array, *, rebound: bool =
     side, v = law.against(q), v.copy()
     e, hit, lost = law.restitution_at(side) * rebound, np.zeros(v.shape, dtype=bool), np.zeros(v.shape)
     A, least = np.broadcast_to(jumps.responses(dyn, q), (*v.shape, v.shape[-1])), np.full(v.shape, np.finfo(float).tiny)
+    rounding = FORCE_ROUNDING * np.abs(v).max(axis=1, keepdims=True, initial=0.0) + np.zeros(v.shape)
     for count in range(2 * _MAX_IMPACTS):
-        outwards = side * v < -_STILL * np.abs(v).max(axis=1, keepdims=True, initial=0.0)
-        if not (rows := np.flatnonzero(outwards.any(axis=1))).size:
+        outwards = -side * v
+        if not (rows := np.flatnonzero((outwards > rounding).any(axis=1))).size:
             break
+        outwards = outwards >= np.maximum(rounding, _FIRST * outwards.max(axis=1, keepdims=True))
         own_e, own, now = e[rows] * (count < _MAX_IMPACTS), side[rows], outwards[rows]
         on, before, responses = (own != 0) & (now | (own_e == 0)), v[rows], A[rows]
         b = np.where(now, 1 + own_e, 1.0) * before
@@ -55,8 +58,9 @@ def after_impacts(jumps: Jumps, dyn: Any, q: Array, v: Array, *, rebound: bool =
         # What is known of the velocities holds to the last bit.
         after = np.where(holds, np.where(now, -own_e, 0.0) * before + 0.0, after)
         lost[rows] += 0.5 * P * (after + before)
+        rounding[rows] += FORCE_ROUNDING * (np.abs(responses) @ np.abs(P)[..., None])[..., 0]
         v[rows], hit[rows] = after, hit[rows] | now
-    return StopImpacts(v, hit, lost)
+    return StopImpacts(np.where((side * v < 0) & (-side * v <= rounding), 0.0, v), hit, lost)
 
 
 def over(jumps: Jumps, dyn: Any, q: Array, v: Array, which: Mask) -> StopImpacts:
