@@ -194,9 +194,8 @@ def off(a: Any, b: Any) -> float:
     return float(np.abs(floats(a) - floats(b)).max(initial=0))
 
 
-def require(run: Any, told: Case, tolerance: float) -> None:
-    """Events have the names and order of the truth; times, positions and the end are its."""
-    assert run.stats.ended == "finished"
+def paired(run: Any, told: Case) -> list[tuple[Any, Event]]:
+    """Return each event of a run with that of the truth, which has the same name."""
     mine, expected = list(run.events), list(zip(told.names(), told.events, strict=True))
     for k, (_, truth) in enumerate(expected):
         if truth.kind == "rests":
@@ -207,7 +206,13 @@ def require(run: Any, told: Case, tolerance: float) -> None:
     if told.end is None:
         mine = mine[: len(expected)]
     assert [e.name for e in mine] == [name for name, _ in expected]
-    for e, (_, truth) in zip(mine, expected, strict=True):
+    return [(e, truth) for e, (_, truth) in zip(mine, expected, strict=True)]
+
+
+def require(run: Any, told: Case, tolerance: float) -> None:
+    """Events have the names and order of the truth; times, positions and the end are its."""
+    assert run.stats.ended == "finished"
+    for e, truth in paired(run, told):
         assert e.t == pytest.approx(float(truth.t), abs=tolerance)
         # What comes to rest has the state of its last hit.
         last = 1e5 if truth.kind == "rests" else 1

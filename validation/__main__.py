@@ -73,6 +73,7 @@ PARTS = {
     "bench_single_calls": Part(1, ("single_calls.json",), "a single call, beside the bare call of the engine"),
     "friction": Part(6, ("friction.json",), "dry friction: references, orders across phases, a smoothed law"),
     "stop_motions": Part(2, ("stop_motions.json",), "joints that meet stops: closed forms, and arcs of 40 digits"),
+    "stops": Part(1, ("stops.json",), "joint stops: times, energies, orders, and batches with and without them"),
     "four_bar": Part(1, ("four_bar.json",), "a loop in four engines: error, gap and time of a step"),
     "mechanisms": Part(5, ("mechanisms.json",), "mechanisms with loops: errors, softness, time of a step"),
     "bicycle": Part(1, ("bicycle.json",), "the benchmark bicycle's eigenvalues beside its paper's formulas and print"),
