@@ -14,6 +14,7 @@ from mbkit.engines.registry import DERIVED, MUJOCO, dynamics, find_engine
 from mbkit.errors import InputError
 from mbkit.methods.registry import ADAPTIVE_METHOD, METHODS
 from mbkit.model import Model
+from mbkit.model.stops import StopLaw
 from mbkit.simulate import Trajectory
 from mbkit.studies import document as doc
 from mbkit.studies._targets import with_values
@@ -49,6 +50,8 @@ def _cell(name: str) -> Any:
 
 
 _COLUMNS: Final = tuple(doc.Column(f.name.replace("_", "\n"), _cell(f.name)) for f in fields(SoftStop))
+#: Distance at which a coordinate is at a limit, rad or m: stiff ones may end a motion before it.
+_TOUCHES: Final = 1e-6
 _UNITS: Final = "Angles are in rad, lengths in m, times in s, energies in J; rigid is what the stop does."
 
 
@@ -152,19 +155,20 @@ def _softer(soft: Any, dt: float) -> Iterator[tuple[str, Any, float]]:
 
 def _rows(softness: str, run: Trajectory, rigid: Trajectory, smooth: Any) -> list[SoftStop]:
     """Return a row for each limit that one of the motions reaches, in the order of arrivals."""
-    model, t, out = smooth.model, run.t, list[SoftStop]()
+    model, law, t, out = smooth.model, StopLaw(rigid.model), run.t, list[SoftStop]()
     n, events = int((t <= rigid.t[-1]).sum()), {x.name: x.t for x in reversed(rigid.events)}
     apart = np.abs(model.difference(rigid.q[np.searchsorted(rigid.t, t[:n])], run.q[:n])).max(axis=0)
     lengths = np.concatenate([[k in j.type.lengths for k in range(j.type.nv)] for j in model.independent_joints])
     off = (float(apart[x].max(initial=0.0)) for x in (~lengths, lengths))
     whole = -float(run.power_balance(smooth)[-1]), -sum(x.energy_change for x in rigid.events), *off
-    for upper, i in np.argwhere(np.isfinite([model.lower, model.upper])).tolist():
-        name, side = model.coordinate_names[i], ("lower", "upper")[upper]
-        beyond = run.q[:, i] - model.upper[i] if upper else model.lower[i] - run.q[:, i]
-        hits, leaves = (events.get(f"{name} {does} its {side} stop", np.nan) for does in ("hits", "leaves"))
-        if (beyond > 0).any() or np.isfinite(hits):
-            times = _crossing(t, beyond), hits, _crossing(t, -beyond), leaves
-            out.append(SoftStop(softness, f"{name} {side}", max(float(beyond.max()), 0.0), *times, *whole))
+    for (upper, k), (_, side) in law.names.items():
+        beyond = (run.q[:, law.places[k]] - law.bounds[upper, k]) * (1 if upper else -1)
+        near = beyond + _TOUCHES
+        hits, leaves = (events.get(law.event(k, 0.5 - upper, does), np.nan) for does in ("hits", "leaves"))
+        if (near > 0).any() or np.isfinite(hits):
+            limit = f"{model.coordinate_names[law.places[k]]} {side}"
+            times = _crossing(t, near), hits, _crossing(t, -near), leaves
+            out.append(SoftStop(softness, limit, max(float(beyond.max()), 0.0), *times, *whole))
     return sorted(out, key=lambda r: np.nanmin([r.arrives, r.arrives_rigid]))
 
 

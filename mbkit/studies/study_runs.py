@@ -172,8 +172,12 @@ def start_state(model: Model, seed: int) -> tuple[Array, Array]:
 def runs_to_limits(dyn: Dynamics, duration: float, seed: int) -> tuple[Trajectory, list[tuple[float, int, int]]]:
     """Return free runs from random states within the limits; and time, run and coordinate of each one's first limit."""
     model = dyn.model
-    start = model.random_state(np.random.default_rng([seed, 3]), size=_RUNS_TO_LIMITS)
-    run = quiet_simulate(dyn, *start, duration, find_engine(dyn.engine).rk4, dt=1e-3)
+    q, v = model.random_state(np.random.default_rng([seed, 3]), size=_RUNS_TO_LIMITS)
+    # Those of mechanisms may be beyond.
+    within = ((q >= model.lower) & (q <= model.upper)).all(axis=1)
+    if not within.any():
+        raise InputError(f"q0: no random state of {model.name} is within its limits; give a start")
+    run = quiet_simulate(dyn, q[within], v[within], duration, find_engine(dyn.engine).rk4, dt=1e-3)
     beyond = (run.q < model.lower) | (run.q > model.upper)
     first = {i: np.argwhere(rows)[0].tolist() for i, rows in enumerate(beyond) if rows.any()}
     return run, sorted((float(run.t[k]), i, coordinate) for i, (k, coordinate) in first.items())
