@@ -339,3 +339,31 @@ def test_moreau_s_steps_rest_on_stops_to_the_bit_and_take_any_number() -> None:
         np.testing.assert_allclose(
             dyn.stop_forces(run.q[-1], run.v[-1], np.zeros(12)), 9.81 * np.arange(12, 0, -1), rtol=1e-12
         )
+
+
+@pytest.mark.parametrize("method", ["rk4", "gauss4"])
+def test_long_steps_take_many_bounces(method: str) -> None:
+    model = slider(lower=-0.05, stops=True, restitution=0.95, gravity=(-9.81, 0, 0)).build()
+    run = mb.simulate(mb.dynamics(model, "lagrangian"), [0.0], [0.0], 40.0, method=method, dt=20.0)
+    first = np.sqrt(2 * 0.05 / 9.81)
+    assert run.stats.ended == "finished"
+    assert run.events[-1].name == "x comes to rest on its lower stop"
+    assert abs(run.events[-1].t - first * (1 + 2 * 0.95 / 0.05)) < 1e-9
+
+
+def test_joints_knock_between_their_stops_in_long_steps() -> None:
+    """One stop swallows, one throws back: they are hit in turn, sooner and sooner, far below a step."""
+    links = [{"mass": 1.0, "com": (0, 0, -0.5), "inertia": (0.1, 0.1, 0.1), "axis": (0, 1, 0)} for _ in range(3)]
+    own = [{"lower": -0.1, "stops": True, "friction": 0.1}, {"lower": 0.2, "stops": True, "restitution": 1.0}]
+    model = chain(
+        *(x | {"translation": (0, 0, -1.0 * (k > 0))} | (own[k] if k < 2 else {}) for k, x in enumerate(links)),
+        gravity=(0, 0, 0),
+    ).build()
+    dyn = mb.dynamics(model, "lagrangian")
+    rng = np.random.default_rng(8)
+    q = np.array([-0.05, 0.25, 0.3]) + 0.04 * rng.uniform(-1, 1, (8, 3))
+    v = np.array([-2.0, -4.0, 3.0]) + rng.standard_normal((8, 3))
+    for dt in (1e-3, 1e-2):
+        run = mb.simulate(dyn, q, v, 0.6, method="rk4", dt=dt)
+        assert run.stats.ended == "finished"
+    assert sum("j1 hits" in x.name for x in run.events) > 20

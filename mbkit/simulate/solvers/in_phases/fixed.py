@@ -449,7 +449,9 @@ class _Members:
         given = self.times(t), *state[:2], self.forces(rows), state[2]
         self.q[rows], self.v[rows], leaving, impacts = self.phases.after(before, *given)
         self._tell(impacts, rows, t)
-        self._empty[rows] = np.where(moved, 0, self._empty[rows] + 1)
+        # Impacts come sooner and sooner, but come to an end.
+        hit = np.isin(np.arange(len(rows)), [x.row for x in impacts]) & pushed
+        self._empty[rows] = np.where(moved | hit, 0, self._empty[rows] + 1)
         decided = self._empty[rows] <= MAX_EMPTY
         for i, time in zip(rows[~decided].tolist(), t[~decided].tolist(), strict=True):
             self._end_early(i, "step_too_small", f"{UNDECIDED} at t = {time:.9g} s: their phases end where they begin")
@@ -558,6 +560,8 @@ class _PartOfStep:
         at_once = soon.min(axis=1) <= -noise
         if at_once.any():
             now[at_once] = self._margins(i[at_once], 0 * length[at_once])
+            # What begins to move has no speed yet; another one ends the phase.
+            now = np.where(soon > -noise[:, None], np.maximum(now, 2 * noise[:, None]), now)
         low, high = np.where(at_once, 0.0, first), np.where(at_once, first, length)
         # A speed that is zero at the end may have faded out long before.
         faded = over.min(axis=1) > -noise
