@@ -367,3 +367,24 @@ def test_joints_knock_between_their_stops_in_long_steps() -> None:
         run = mb.simulate(dyn, q, v, 0.6, method="rk4", dt=dt)
         assert run.stats.ended == "finished"
     assert sum("j1 hits" in x.name for x in run.events) > 20
+
+
+def test_bounces_that_a_hit_elsewhere_wakes_do_not_end_twice() -> None:
+    links = [{"mass": 1.0, "com": (0.25, 0, 0), "inertia": (0.02, 0.02, 0.02), "axis": (0, 1, 0)} for _ in range(2)]
+    own = [
+        {"lower": -2.0, "upper": 0.4, "stops": True, "restitution": 0.4},
+        {"lower": -0.5, "upper": 0.3, "stops": True},
+    ]
+    model = chain(links[0] | own[0], links[1] | own[1] | {"translation": (0.5, 0, 0)}).build()
+    for q in np.random.default_rng(0).uniform([-1.0, -0.4], [0.2, 0.2], (6, 2)):
+        runs = [
+            mb.simulate(mb.dynamics(model, "lagrangian"), q, [0.0, 0.0], 3.0, method=m, **how)
+            for m, how in (("rk853", {"rtol": 1e-12}), ("rk4", {"dt": 1e-3}))
+        ]
+        for run in runs:
+            times = [x.t for x in run.events]
+            assert times == sorted(times)
+            assert times[-1] <= 3.0
+            last = {name: max(x.t for x in run.events if x.name == name) for name in {x.name for x in run.events}}
+            assert last["j0 comes to rest on its upper stop"] >= last["j0 hits its upper stop"]
+        assert [x.name for x in runs[0].events] == [x.name for x in runs[1].events]

@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from mbkit._check import EPS, Array
 from mbkit.model.description import Description
 
+#: Verbs of events.
+HITS: Final = "hits"
+RESTS: Final = "comes to rest on"
 #: Distance from a bound, relative to it and in rad or m where it is smaller, that is rounding of a coordinate.
 TOUCHING: Final = 64 * EPS
 

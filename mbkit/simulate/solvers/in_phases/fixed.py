@@ -26,7 +26,7 @@ from mbkit.simulate.problem import SIDE_BY_SIDE, IntegrationProblem, Solver
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.run_data import Ended, SolverResult
 from mbkit.simulate.singular_poses import SingularPoses
-from mbkit.simulate.solvers.in_phases.phases import Impact, Phase, Phases, force_of, of_each, side_by_side
+from mbkit.simulate.solvers.in_phases.phases import Impact, Phase, Phases, force_of, in_order, of_each, side_by_side
 from mbkit.simulate.solvers.stretches import MAX_EMPTY
 from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.time_grid import Grid, Indices
@@ -65,7 +65,7 @@ def run_fixed_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics]
         _Members(problem, every[i : i + 1], solver, record, alone=True).to_end()
         if record.error is not None:
             break
-    record.events.sort(key=lambda x: (x.member or 0, x.t))
+    record.events = in_order(record.events, problem.end)
     return record.result()
 
 

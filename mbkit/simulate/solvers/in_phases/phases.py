@@ -31,6 +31,7 @@ from mbkit.errors import NumericalError
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.parts import POSE_ROUNDING, RESTING, ROUNDING, STOPPED
+from mbkit.model.stops import HITS, RESTS
 from mbkit.simulate.constraint_projection import settled
 from mbkit.simulate.events import Hit
 from mbkit.simulate.problem import IntegrationProblem
@@ -219,6 +220,23 @@ class Impact(NamedTuple):
     def event(self, t: float, q: Array, member: int | None) -> Hit:
         """Return the event of a run."""
         return Hit(self.name, t + self.delay, q, self.after.copy(), member, self.before, self.energy_change)
+
+
+def in_order(events: Sequence[Hit], end: float) -> list[Hit]:
+    """Return the events of trajectories by time, up to the end of the run.
+
+    The end of bounces is known before it comes, and does not come where the joint is hit again before.
+    """
+    ends, gone = dict[tuple[int | None, str], int](), set[int]()
+    for k, x in enumerate(events):
+        rests = x.name.replace(f" {HITS} ", f" {RESTS} ")
+        own = x.member, rests
+        if rests == x.name:
+            ends[own] = k
+        elif events[ends.get(own, k)].t > x.t:
+            gone.add(ends[own])
+    left = (x for k, x in enumerate(events) if k not in gone and x.t <= end)
+    return sorted(left, key=lambda x: (x.member or 0, x.t))
 
 
 class Phases:
@@ -485,16 +503,16 @@ class Phases:
         out = self.stopped(rubbed, t, q, out, out == 0)
         _rows(leaving)[rows] = 0.0
         for k in np.flatnonzero(hits.any(axis=1)).tolist():
-            told: Array | None = before[k]
+            first: Array | None = before[k]
             # Of a stop that was not hit, and has a part in the impact, the first event tells.
             others = float(np.where(hits[k], 0.0, taken[k]).sum())
             for i in np.flatnonzero(hits[k]).tolist():
                 name, row = partial(self._stops.event, i, side[k, i]), int(rows[k])
-                impacts.append(Impact(row, i, name("hits"), 0.0, new[k], told, float(taken[k, i]) + others))
-                told, others = None, 0.0
+                impacts.append(Impact(row, i, name(HITS), 0.0, new[k], first, float(taken[k, i]) + others))
+                first, others = None, 0.0
                 if ends[k, i] and e[k, i]:
                     last = float(delays[k, i]), _rows(out)[row], None, float(left[k, i])
-                    impacts.append(Impact(row, i, name("comes to rest on"), *last))
+                    impacts.append(Impact(row, i, name(RESTS), *last))
         return out, leaving, impacts
 
     def stopped(self, dyn: Dynamics, t: float | Array, q: Array, v: Array, rests: Mask) -> Array:
@@ -518,7 +536,7 @@ class Phases:
             if not side[row, i]:
                 out.append((row, f"{self._names[i]} {what}"))
             elif rested[row, i] or (row, i) not in hit:
-                does = "comes to rest on" if rests[row, i] else "leaves"
+                does = RESTS if rests[row, i] else "leaves"
                 out.append((row, self._stops.event(i, side[row, i], does)))
         return out
 

@@ -20,7 +20,7 @@ from mbkit.simulate.progress import Progress
 from mbkit.simulate.run_data import SolverResult
 from mbkit.simulate.solvers.fixed_step import run_fixed
 from mbkit.simulate.solvers.in_phases.fixed import UNDECIDED, run_fixed_in_phases
-from mbkit.simulate.solvers.in_phases.phases import Phase, Phases
+from mbkit.simulate.solvers.in_phases.phases import Phase, Phases, in_order
 from mbkit.simulate.solvers.stretches import Stretch, run_in_stretches
 from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result
 from mbkit.simulate.time_grid import Grid
@@ -39,6 +39,7 @@ def run_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics], Solv
             first = _Friction(problem, i).first
             endless = f"{UNDECIDED} at t = {{t:.9g}} s: their phases end where they begin"
             records.append(run_in_stretches(problem, i, first, solver, endless))
+            records[-1].events = in_order(records[-1].events, records[-1].reached)
     return assemble_result(problem, records)
 
 
