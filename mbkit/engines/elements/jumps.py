@@ -148,7 +148,7 @@ class Jumps(AddedForce):
             def of_forward(q: Array, v: Array, tau: Array) -> Any:
                 if law.at_rest(q, v).any():
                     warn(
-                        f"{self._model.name}: no derivative at rest under {self._words}, which is left out of these; take "
+                        f"{self._model.name}: no derivative at rest under {self._words}, so left out of these; take "
                         "model.smooth to do so knowingly, or velocities that are not zero",
                         MbkitWarning,
                     )
