@@ -212,6 +212,25 @@ def test_a_result_goes_through_json_and_shows_its_sentence_first() -> None:
     assert found.to_csv().count("\n") == 3
 
 
+def test_a_block_that_rests_on_its_limit_sinks_into_the_soft_one() -> None:
+    found = mb.soft_stops(slider(), [-0.5], duration=0.5)
+    usual, half = found.rows
+    assert usual.lost_rigid == 0.0
+    # At rest the limit carries the weight by (A + R) m g = k d r + g, where A = 1/m and R = (1 - d) / d A.
+    for row, constant in ((usual, 0.02), (half, 0.01)):
+        law = Softness((constant, 1.0))
+        dyn = mb.dynamics(slider(), "mujoco", limits={"x": law})
+        r = -0.5 - float(mb.simulate(dyn, [-0.5], [0.0], 1.0, "mujoco_rk4", 1e-3).q[-1, 0])
+        d = law.impedance(r)
+        assert np.isclose(law.gains[0] * d * r, 9.81 * (1 - d) / d, rtol=1e-9)
+        assert r < row.penetration < 1.01 * r
+    assert np.isclose(usual.moved, usual.penetration, rtol=1e-9)
+    with pytest.raises(InputError, match="q0, v0: expected one state"):
+        mb.soft_stops(slider(), [[0.0], [0.1]])
+    with pytest.raises(InputError, match="expected q0 beside it"):
+        mb.soft_stops(slider(), v0=[1.0])
+
+
 def test_a_start_is_found_whose_motion_reaches_a_limit() -> None:
     model = mb.catalog.double_pendulum()
     with pytest.raises(InputError, match="expected joints with limits, double_pendulum has none"):

@@ -52,7 +52,6 @@ def _cell(name: str) -> Any:
 _COLUMNS: Final = tuple(doc.Column(f.name.replace("_", "\n"), _cell(f.name)) for f in fields(SoftStop))
 #: Distance at which a coordinate is at a limit, rad or m: stiff ones may end a motion before it.
 _TOUCHES: Final = 1e-6
-_UNITS: Final = "Angles are in rad, lengths in m, times in s, energies in J; rigid is what the stop does."
 
 
 @dataclass(frozen=True, repr=False)
@@ -91,7 +90,8 @@ class SoftStops(ResultTable):
     def document(self) -> doc.Document:
         """Return the document: the verdict, then the limits."""
         start = f"{self.method} at {time_text(self.dt)} from q0 = {self.q0}, v0 = {self.v0}"
-        below = doc.Items([doc.Bullet("", x) for x in (*self.doubts, start, *self.notes, _UNITS)])
+        units = "angles are in rad, lengths in m, times in s, energies in J; rigid is what the stop does"
+        below = doc.Items([doc.Bullet("", x) for x in (*self.doubts, start, *self.notes, units)])
         section = doc.Section("Limits that are reached", [doc.Table(_COLUMNS, self.rows), below])
         return doc.Document(self.model, self.verdict, good=True, marked=False, sections=[section], result=self)
 
@@ -126,9 +126,13 @@ def soft_stops(
     if not soft._soft_limits:
         raise InputError(f"model: expected joints with limits, {bare.name} has none")
     if q0 is None:
+        if v0 is not None:
+            raise InputError("v0: expected q0 beside it")
         free, reached = runs_to_limits(smooth, duration, seed)
         q0, v0 = (x[reached[0][1] if reached else 0, 0] for x in (free.q, free.v))
     start = bare.check_q(q0, "q0"), bare.check_v(np.zeros(bare.nv) if v0 is None else v0, "v0")
+    if start[0].ndim > 1 or start[1].ndim > 1:
+        raise InputError(f"q0, v0: expected one state, got shapes {start[0].shape}, {start[1].shape}")
     natives = [m.name for m in METHODS.values() if m.kind == "native" and m.on(engine)]
     method = max(natives, key=lambda x: x == find_engine(engine).rk4)
     runs = {text: quiet_simulate(dyn, *start, duration, method, h) for text, dyn, h in _softer(soft, dt)}
@@ -169,7 +173,7 @@ def _rows(softness: str, run: Trajectory, rigid: Trajectory, smooth: Any) -> lis
             limit = f"{model.coordinate_names[law.places[k]]} {side}"
             times = _crossing(t, near), hits, _crossing(t, -near), leaves
             out.append(SoftStop(softness, limit, max(float(beyond.max()), 0.0), *times, *whole))
-    return sorted(out, key=lambda r: np.nanmin([r.arrives, r.arrives_rigid]))
+    return sorted(out, key=lambda r: np.nan_to_num([r.arrives, r.arrives_rigid], nan=np.inf).min())
 
 
 def _crossing(t: Array, x: Array) -> float:
