@@ -323,6 +323,17 @@ def with_joint(type_: str = "revolute", **numbers: Any) -> Callable[[str], Examp
     return make
 
 
+def _on_a_stop(name: str) -> Example:
+    """An arm whose last joint rests on its lower stop, into which its load pushes it."""
+    a = arm(name)
+    bound = 0.25 - 0.1 * a.case.n
+    place = {"mass": 0.7, "com": (0.1, 0.2, -0.1), "inertia": (0.1, 0.2, 0.25), "axes": ((0, 0.6, 0.8),)}
+    a.add("x", "revolute", "b2", "x", **place, lower=bound, stops=True, restitution=0.3)
+    (own,) = a.case.parts
+    own.stops, a.case.v[-1] = ((a.link["x"], 1.0, bound),), 0.0
+    return a.built(("joint stops",))
+
+
 def along(c: Case, x: np.ndarray, type_: str, link: int) -> np.ndarray:
     """Return E with v = E ẋ of the joint whose links begin there: a ball's and a free body's are in its axes."""
     E = c.G[link : link + size_of(type_)]
@@ -810,6 +821,7 @@ EXAMPLES: dict[str, Callable[[str], Example]] = {
     **{f"joint.{name}": with_joint(**x) for name, x in NUMBERS.items()},
     **{f"joint.{name}.several": with_joint(type_, **x) for name, (type_, x) in SEVERAL.items()},
     "joint.stiction": with_joint(**STICTION),
+    "joint.stop": _on_a_stop,
     **{k: alone(part, words=("'j0'",) if "motion" in k else ()) for k, part in PARTS.items()},
     **{k: alone(part, gravity=True) for k, part in WEIGHTS.items()},
     **{k: alone(part, 0) for k, part in LIMBS.items()},

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import chain, combinations
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ import numpy as np
 import mbkit as mb
 
 _STEP = 1e-30
+#: Distance, velocity and force at a stop that are rounding.
+_TOUCHING = 1e-9
 GRAVITY = np.array([0.7, -0.4, -9.81])
 #: Place of the frame `tip` on the last body, m.
 TIP = (0.1, 0.2, 0.3)
@@ -65,6 +68,8 @@ class Part:
     #: Rows A of velocities alone, with A v = b, of (case, q); and b.
     speeds: Callable[..., np.ndarray] | None = None
     speed: float = 0.0
+    #: Stops: the link, the side that it pushes to, and the bound of its full coordinate.
+    stops: tuple[tuple[int, float, float], ...] = ()
 
 
 @dataclass
@@ -271,9 +276,23 @@ class Case:
                 bias = np.append(bias, np.imag(part.speeds(self, q + 1j * _STEP * v) @ v) / _STEP)
         for k in hold:
             J, bias = np.vstack([J, np.eye(self.n)[k]]), np.append(bias, 0.0)
-        m = len(J)
-        kkt = np.block([[self.mass_matrix(q), J.T], [J, np.zeros((m, m))]])
-        return np.linalg.solve(kkt, np.concatenate([f, -bias]))[: self.n]
+        touched = self.touched(q, v)
+        # Of all that could push, those that do, while the others let go: the motion is one.
+        for pushing in chain(*(combinations(range(len(touched)), k) for k in range(len(touched) + 1))):
+            rows = np.vstack([J, touched[[*pushing]]])
+            m = len(rows)
+            kkt = np.block([[self.mass_matrix(q), rows.T], [rows, np.zeros((m, m))]])
+            found = np.linalg.solve(kkt, np.concatenate([f, -bias, np.zeros(len(pushing))]))
+            if (touched @ found[: self.n] > -_TOUCHING).all() and (found[self.n + len(J) :] < _TOUCHING).all():
+                return found[: self.n]
+        raise AssertionError("no stops that push and let go")
+
+    def touched(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return the rows of the stops that links rest on, inwards, (k, n)."""
+        y, u = self.G @ q + self.c, self.G @ v
+        at = [x for part in self.parts for x in part.stops]
+        on = [side * self.G[k] for k, side, bound in at if max(side * (y[k] - bound), side * u[k]) < _TOUCHING]
+        return np.reshape(on, (-1, self.n))
 
     def held(self, t: float, q: np.ndarray) -> np.ndarray:
         """Return J of all rows, (m, n)."""

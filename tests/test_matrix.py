@@ -115,6 +115,7 @@ def test_a_kind_acts_alone_and_is_taken_out(name: str) -> None:
     model = example(name)
     finer = name.rpartition(".")[0]
     also = {"force.of_time": "force.joint", "joint.limit.several": "joint.limit", "joint.stiction": "joint.friction"}
+    also |= {"joint.stop": "joint.limit"}
     also |= dict.fromkeys(("written.row", "written.speed", "written.t", "written.stop"), "energies")
     wanted = {name, also.get(name, ""), finer} & {*PART_KINDS}
     # What holds a weight has one.
