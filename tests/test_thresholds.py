@@ -347,14 +347,15 @@ def drawn_anywhere(k: int) -> bool:
 
 
 def compiles_moreau(responses: int) -> bool:
-    model = Stub(effects={"jump"}, constrained=True, nv=responses)
+    needs = Stub(friction=True, stops=False)
+    model = Stub(effects={"jump"}, needs=needs, constrained=True, nv=responses)
     dyn = Stub(_derived=True, _compiles_steps=True, model=model, _jumps=Stub(law=Stub(which=[0])))
     return moreau._compiles(Stub(dyn=dyn, torque=Stub(callable=False)))
 
 
 def compiles_rounds(joints: int) -> bool:
     dyn = Stub(_derived=True, _compiles_steps=True, _code=lambda *_, **__: None)
-    return jumps.Jumps._rounds(Stub(law=Stub(which=range(joints))), dyn) is not None
+    return jumps.Jumps._rounds(Stub(law=Stub(which=range(joints), stops=None)), dyn) is not None
 
 
 def blames_the_engine(size: float) -> bool:

@@ -27,7 +27,7 @@ from mbkit.model.elements.paths import Path
 
 #: Wrenches by the names of the frames on which they act.
 Wrenches = Mapping[str, ArrayLike]
-_CARRIED: Final = ("q", "loss", "jump", "row", "bound", "t", "gravity", "point.spring")
+_CARRIED: Final = ("q", "loss", "jump", "stop", "row", "bound", "t", "gravity", "point.spring")
 #: Whose energies are of coordinates alone, and act along the directions of joints.
 _OF_COORDINATES: Final = ("joints", "couplings")
 _BY_FUNCTIONS: Final = "forces by functions are known by what they do to the motion, not to single bodies"

@@ -25,6 +25,7 @@ from mbkit.load.xml_reader import reserved, unused
 from mbkit.model import Body, Joint, Model, ModelBuilder, kind_of
 from mbkit.model.elements.kinds import joint_types
 from mbkit.model.elements.paths import Path
+from mbkit.model.stops import AS_LIMITS
 from mbkit.model.validation import body_fault, listing
 
 _AXES: Final = dict(zip("XYZ", np.eye(3), strict=True))
@@ -222,6 +223,7 @@ URDF: Final = Path(
     "urdf",
     "URDF cannot say of",
     joint_types(*_TYPES) | {*_CARRIED.split(), *(f"joint.{x}" for x in DYNAMICS)},
+    notes={"joint.stop": AS_LIMITS},
     beside=_notes,
 )
 

@@ -297,7 +297,8 @@ class Joint(_Frozen):
     stribeck_velocity: Annotated[Array | None, NumberRule("rad/s, m/s", OF_V, least=0.0, fixed=_CURVE, absent=0.0)] = (
         None
     )
-    restitution: Annotated[Array | None, NumberRule("", OF_V, fixed=_NEWTONS, absent=0.0)] = None
+    # With -1 a velocity passes.
+    restitution: Annotated[Array | None, NumberRule("", OF_V, fixed=_NEWTONS, absent=-1.0)] = None
 
     def __repr__(self) -> str:
         follows = f", follows {self.mimic.joint!r}" if self.mimic else ""

@@ -147,7 +147,8 @@ def _to_urdf(model: Model) -> Converted:
         path.write_text(text, encoding="utf-8")
         with warnings.catch_warnings(action="ignore", category=MbkitWarning):
             back = load(path, gravity=model.gravity, nonphysical="warn")
-    explanation = explain(model, back, samples=PROBES, tolerance=ITERATED, names=("description", "URDF"))
+    own = model.without("stops")
+    explanation = explain(own, back, samples=PROBES, tolerance=ITERATED, names=("description", "URDF"))
     if explanation.acting or not (explanation.agree or explanation.massless):
         reasons = "; ".join(map(str, explanation.acting)) or explanation.verdict
         raise MbkitError(

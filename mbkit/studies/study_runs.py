@@ -149,7 +149,8 @@ def integrable(model: Model, *, native: bool = True) -> tuple[Model, list[str]]:
     notes = []
     if "jump" in model.effects:
         # No reference of series crosses jumps, and no engine's own integrator holds them exactly.
-        model, notes = model.smooth, [f"without {EFFECTS['jump']}"]
+        acting = {"jump": model.needs.friction, "stop": model.needs.stops}
+        model, notes = model.smooth, [f"without {EFFECTS[x]}" for x, there in acting.items() if there]
     if native and model.layout.reduced:
         model, notes = free_of_mimic(model), [*notes, "mimic joints free"]
     return model, notes

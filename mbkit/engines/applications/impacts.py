@@ -20,7 +20,8 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, batch_of, real, real_array, require_finite, with_shapes
 from mbkit._reproducible import independent_rows, under_rows
 from mbkit.engines.base import Dynamics, no_dynamics
-from mbkit.errors import InputError, NumericalError
+from mbkit.engines.elements.stop_impacts import after_impacts
+from mbkit.errors import InputError, NumericalError, UnsupportedError
 
 
 @with_shapes
@@ -78,6 +79,8 @@ def impact(
         For unusable arguments, or where there is neither an impulse nor a row.
     NumericalError
         Rows of G depend on each other or on the constraints at this pose, or M is singular.
+    UnsupportedError
+        A joint at a stop would go through it.
 
     Examples
     --------
@@ -121,6 +124,11 @@ def impact(
     change, P = np.zeros(v.shape), np.zeros(wanted.shape)
     for i in np.ndindex(lead):
         change[i], P[i] = _solved(model.name, i, M[i], R[i], given[i], wanted[i], k)
+    if model.needs.stops:
+        ends = q.reshape(-1, model.nq), (v + change).reshape(-1, model.nv)
+        if (hit := after_impacts(dyn._jumps, dyn, *ends).hit.any(axis=0)).any():
+            name = model.velocity_names[int(np.argmax(hit))]
+            raise UnsupportedError(f"impact: {model.name}: {name} would go through its stop; give jacobian its row too")
     energy = 0.5 * np.einsum("...i,...ij,...j->...", change, M, 2 * v + change)
     return Impact(v + change, P[..., :k], P[..., k:], float(energy) if not lead else energy)
 

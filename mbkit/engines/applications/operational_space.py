@@ -26,8 +26,8 @@ _ROWS: Final = {"linear": (0, 1, 2), "angular": (3, 4, 5)}
 OPERATIONAL_SPACE: Final = Path(
     "operational space",
     "operational_space: not known of",
-    ALL - {"row", "speed", "energies"},
-    dict.fromkeys(("row", "speed"), "changes the inertia that a frame feels"),
+    ALL - {"row", "speed", "stop", "energies"},
+    dict.fromkeys(("row", "speed", "stop"), "changes the inertia that a frame feels"),
 )
 
 

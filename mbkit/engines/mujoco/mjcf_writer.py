@@ -23,6 +23,7 @@ from mbkit.methods.simulation_settings import Servo, Settings
 from mbkit.model import Joint, Model
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import Path
+from mbkit.model.stops import AS_LIMITS
 
 _TYPES: Final = tuple(KINDS)
 #: Largest number that MuJoCo takes.
@@ -62,7 +63,8 @@ MJCF: Final = Path(
         "mimic": "mimic joints are free joints with equality constraints, which MuJoCo keeps softly",
         "row": "loops are equality constraints, which MuJoCo keeps softly",
         "joint.limit": "MuJoCo acts on joint limits, softly, which mbkit's terms leave out",
-        "jump": f"MuJoCo's {EFFECTS['jump']} is soft; mbkit's holds exactly at rest",
+        "joint.stop": AS_LIMITS,
+        "joint.friction": f"MuJoCo's {EFFECTS['jump']} is soft; mbkit's holds exactly at rest",
         "joint.velocity_limit": "MJCF has no velocity limits",
     },
     also=_numbers_not_held,

@@ -74,8 +74,10 @@ def _largest_jump(model: Model, forces: Array) -> Finding | None:
 def _limits(model: Model) -> Finding | None:
     # What the same joints have stands together, and a finer kind with its own.
     there = [x for x in that_do("bound", "joints") if x in model.acts and x.rpartition(".")[0] not in PART_KINDS]
-    alike = by_key((model.acts[x], kind(x).words.rpartition("has ")[2]) for x in there)
-    parts = [f"{', '.join(some)} at {counted(len(joints), 'joint')}" for joints, some in alike.items()]
+    stops = {*model.acts.get("joint.stop", ())}
+    off = {x: tuple(n for n in model.acts[x] if x != "joint.limit" or n not in stops) for x in there}
+    alike = by_key((off[x], kind(x).words.rpartition("has ")[2]) for x in there)
+    parts = [f"{', '.join(some)} at {counted(len(joints), 'joint')}" for joints, some in alike.items() if joints]
     if not parts:
         return None
     every = tuple(dict.fromkeys(name for some in alike for name in some))
@@ -315,7 +317,7 @@ def omissions(model: Model, engines: Mapping[str, Dynamics], seed: int) -> tuple
 def _in_mujoco(model: Model, dyn: Any, q: Array, v: Array) -> list[Omission]:
     from mbkit.engines.mujoco.engine import Variant
 
-    needs = model.needs.as_dict() | {"jump": "jump" in model.effects}
+    needs = model.needs.as_dict() | {"jump": model.needs.friction}
     variants = {
         need: Variant(dyn, bits, spheres=not field)
         for need, field, bits, _ in _NEEDS
@@ -341,6 +343,7 @@ def _in_mujoco(model: Model, dyn: Any, q: Array, v: Array) -> list[Omission]:
         spread = math.hypot(times[need][1], times["lean"][1])
         # A part that is there and off would act: leaving it out is a choice, said aloud, and no engine's fault.
         instead = f"without it mbkit's exact {_JUMP} acts" if need == _JUMP else ""
+        instead = f"without it mbkit's {EFFECTS['stop']} act" if need == "limits" and model.needs.stops else instead
         note = instead or "it is off in every engine, so that the smooth terms compare" if present else ""
         unchanged = changes[need] <= _MAX_UNCHANGED
         rows.append(Omission(need, present, what, saved, spread, math.nan, changes[need], unchanged, note))

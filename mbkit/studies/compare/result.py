@@ -362,6 +362,8 @@ class Comparison(ResultTable):
         if rows and rubbing:
             size = f"{rubbing[0]:.2g} times the other forces"
             out += [f"rollouts and error against run time are without {EFFECTS['jump']} ({size})"]
+        if rows and self.facts["needs"].get("stops"):
+            out += [f"rollouts and error against run time are without {EFFECTS['stop']}"]
         judged = [r for r in rows if r.judged]
         if rows and not judged:
             out.append(f"none of {len(rows)} rollouts judged" if len(rows) > 1 else "the rollout not judged")

@@ -21,6 +21,7 @@ from mbkit.errors import UnsupportedError
 from mbkit.model import Model
 from mbkit.model.manifold import limits_box
 from mbkit.model.quantities import QUANTITIES
+from mbkit.model.stops import StopLaw
 from mbkit.studies.compare.errors import (
     Errors,
     Scales,
@@ -66,7 +67,8 @@ def states(model: Model, samples: int, seed: int) -> States:
         parts.append(("at limits", _at_limits(model, rng, few)))
         parts.append(("near singular", _near_singular(model, rng, few)))
         if "jump" in model.effects:
-            parts.append((_AT_REST, model.random_state(rng, few)[0]))
+            q_at_rest = model.random_state(rng, few)[0]
+            parts.append((_AT_REST, StopLaw(model).onto(q_at_rest, np.ones((few, model.nv), dtype=bool))))
     q = np.concatenate([x for _, x in parts])
     v = np.concatenate([v, rng.standard_normal((len(q) - samples, model.nv))])
     a, tau = rng.standard_normal((2, len(q), model.nv))

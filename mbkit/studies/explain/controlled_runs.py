@@ -339,8 +339,9 @@ def runnable(first: World, second: World) -> tuple[World, World, list[str]]:
         for world in (first, second):
             if world.settings.engine == DEFAULTS.engine:
                 # Constraints and mimic joints are soft in MuJoCo: nobody gets that who has not asked.
-                if not asked and (world.system.model.constrained or world.system.model.layout.reduced):
-                    raise UnsupportedError("constraints and mimic joints hold exactly")
+                model = world.system.model
+                if model.needs.stops or (not asked and (model.constrained or model.layout.reduced)):
+                    raise UnsupportedError("constraints, mimic joints and stops hold exactly")
                 OwnSimulation(world.system.model, world.settings)
     except UnsupportedError as error:
         exact = {"engine": EXACT[0], "integrator": EXACT[1]}

@@ -84,6 +84,7 @@ _FIELD_KINDS: Final = {
     "axes": "axis",
     "stiffness": "spring",
     "rest": "spring",
+    "restitution": "stops",
 }
 _PLACE: Final = ("rotation", "translation")
 _SPRING: Final = ("stiffness", "rest")
@@ -422,6 +423,8 @@ def fitted_joint(a: Joint, b: Joint, near: Tolerances) -> Iterator[Mistake]:
         whole = {n: getattr(b, n) for n in groups_of(a, b)[1]}
         yield Mistake("joint kind", f"has it as a {b.kind} joint, not a {a.kind} one", whole)
         return
+    if (a.restitution is None) != (b.restitution is None):
+        yield Mistake("stops", f"has {'no ' * a.stops}stops", {"restitution": b.restitution})
     turn, shift = turn_of(a.rotation.T @ b.rotation), a.rotation.T @ (b.translation - a.translation)
     rotation, translation = {"rotation": b.rotation}, {"translation": b.translation}
     if a.type.axial and a.type.rotates and np.allclose(np.cross(turn, a.axes[0]), 0.0, atol=1e-9):

@@ -29,6 +29,7 @@ from mbkit.model.elements.forces import coordinate_arguments
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.references import _OF_BODIES, _OF_JOINTS, names_in
 from mbkit.model.model import unchecked
+from mbkit.model.stops import StopLaw
 from mbkit.studies.compare import terms
 from mbkit.studies.compare.errors import Scales
 from mbkit.studies.compare.terms import States
@@ -132,10 +133,24 @@ def gaps(a: Values, b: Values, at: States, model: Model) -> Gaps:
 
 
 def jump_gap(a: Model, b: Model) -> Gaps:
-    """Return the difference of forces that jump at rest and about the Stribeck velocities, which random states miss.
+    """Return the differences of stops, and of forces that jump at rest and about the Stribeck velocities.
 
-    Each velocity's is relative to its own.
+    Random states miss both. Each velocity's force is relative to its own; a bound that one side alone has counts 1.
     """
+    return (*_friction_gap(a, b), *_stop_gap(a, b))
+
+
+def _stop_gap(a: Model, b: Model) -> Gaps:
+    ours, theirs = map(StopLaw, (a, b))
+    if not (ours or theirs):
+        return ()
+    with np.errstate(invalid="ignore"):
+        apart = np.nan_to_num(np.minimum(np.abs(theirs.bounds - ours.bounds), 1.0))
+    apart = np.maximum(apart, np.abs(theirs.restitution - ours.restitution)).max(axis=0)
+    return (Gap(EFFECTS["stop"], float(apart.max()), a.velocity_joints[int(np.argmax(apart))]),)
+
+
+def _friction_gap(a: Model, b: Model) -> Gaps:
     numbers = [JumpNumbers.of(x.joints) for x in (a, b)]
     if all((x.bound == x.sliding).all() for x in numbers):
         return ()
