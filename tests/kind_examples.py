@@ -324,10 +324,10 @@ def with_joint(type_: str = "revolute", **numbers: Any) -> Callable[[str], Examp
 
 
 def _on_a_stop(name: str) -> Example:
-    """An arm whose last joint rests on its lower stop, into which its load pushes it."""
+    """An arm whose last joint rests on its lower stop, into which its load and the other velocities push it."""
     a = arm(name)
     bound = 0.25 - 0.1 * a.case.n
-    place = {"mass": 0.7, "com": (0.1, 0.2, -0.1), "inertia": (0.1, 0.2, 0.25), "axes": ((0, 0.6, 0.8),)}
+    place = {"mass": 0.7, "com": (-0.3, -0.2, -0.1), "inertia": (0.1, 0.2, 0.25), "axes": ((0, 0.6, 0.8),)}
     a.add("x", "revolute", "b2", "x", **place, lower=bound, stops=True, restitution=0.3)
     (own,) = a.case.parts
     own.stops, a.case.v = ((a.link["x"], 1.0, bound),), np.append(np.abs(a.case.v[:-1]), 0.0)

@@ -30,7 +30,9 @@ ENGINES = ("lagrangian", "pinocchio", "mujoco", "drake", "oracle")
 #: Effects, or kinds, that a column's quantity depends on; all but limits, which are data, where it is not named.
 EVERY = frozenset(EFFECTS) - {"bound"}
 SEES: dict[str, frozenset[str]] = {
-    **{f"{e}: M and inverse dynamics": EVERY - {"row", "speed"} for e in ENGINES},
+    **{f"{e}: M and inverse dynamics": EVERY - {"row", "speed", "stop"} for e in ENGINES},
+    # Its algorithms have no accelerations.
+    "URDF in Pinocchio alone": EVERY - {"stop"},
     **{f"{e}: energies": frozenset("TV") for e in ENGINES},
     **{f"{e}: frames": frozenset() for e in ENGINES},
     **dict.fromkeys(("regressor", "base parameters"), frozenset({"gravity"})),
@@ -55,8 +57,10 @@ WITHOUT_ENERGY = ("force.frame",)
 #: Gates of runs that no engine here has; `tests.test_trained_engines` goes through them where one is.
 ELSEWHERE = ("newton", "remote runs of joints")
 #: Refusals that no check finds needed. Whether motions that a coupler leaves still tell the tree's base parameters
-#: depends on the axes that it binds; they do in these examples. Terms of a system are the same beside a stop.
+#: depends on the axes that it binds; they do in these examples. Terms of a system are the same beside a stop. What rests
+#: on a stop has no event, a torque that holds it is one of many, and torques that are identified are those off stops.
 NEEDLESS = {"base parameters": ("coupler", "coupler.several"), "derivation": ("written.stop",)}
+NEEDLESS |= dict.fromkeys(("runs without phases", "equilibrium", "identification"), ("joint.stop",))
 
 
 @dataclass(frozen=True)
@@ -133,7 +137,7 @@ def dropped(name: str, gate: str, folder: Path) -> Mutant | None:
     # MuJoCo's friction is not asked for where there is none, runs with friction go by phases, and energies are on paper
     # already.
     dry = x.model.needs.friction
-    asked = {"mujoco friction loss": dry, "symplectic runs": not dry, "paper": x.model.has_bodies}
+    asked = {"mujoco friction loss": dry, "symplectic runs": "jump" not in x.model.effects, "paper": x.model.has_bodies}
     if not (own.takes(gone) and asked.get(gate, True)) or own.refuses(x.model):
         return None
 
@@ -169,7 +173,8 @@ def sees(k: Kind, path: str) -> bool:
     seen = SEES.get(path, EVERY)
     if path.endswith("energies") and k.name in WITHOUT_ENERGY:
         return False
-    return bool({k.name, *k.does - {"t"}} & seen) or (k.does == {"t"} and "force" in seen)
+    does = k.does - ({"t", "jump"} if "stop" in k.does else {"t"})
+    return bool({k.name, *does} & seen) or (k.does == {"t"} and "force" in seen)
 
 
 def removed(name: str, path: str, folder: Path) -> Mutant | None:

@@ -293,8 +293,8 @@ IDENTIFICATION: Final = replace(
     BASE_PARAMETERS,
     name="identification",
     words="identify: not known of",
-    carries=BASE_PARAMETERS.carries - {"t"},
-    why={"t": "samples have no times"},
+    carries=BASE_PARAMETERS.carries - {"t", "stop"},
+    why={"t": "samples have no times", "stop": "samples on one have its force"},
     also=lambda m: (
         f"{f}, which depends on masses that are sought" for f in m.forces if type(f) is GravityCompensation
     ),

@@ -271,7 +271,7 @@ def energy_regressor(model: Description, q: Array, v: Array, gravity: Array) -> 
 BASE_PARAMETERS: Final = Path(
     "base parameters",
     "base parameters: expected a tree of free joints, got of",
-    frozenset(["q", "T", "V", "loss", "jump", "force", "bound", "t"]),
+    frozenset(["q", "T", "V", "loss", "jump", "stop", "force", "bound", "t"]),
 )
 
 

@@ -56,25 +56,25 @@ def states(model: Model, samples: int, seed: int) -> States:
     """Return `samples` random states; without constraints also neutral, at-limit and near-singular ones.
 
     Near singular: every angle 1e-4 from a multiple of a right angle, which is near gimbal lock and stretched arms. With
-    forces that jump, also states in which every other velocity is at rest, or all are.
+    forces that jump, also states in which every other velocity is at rest, or all are; with stops, at rest on these.
     """
     rng = np.random.default_rng(seed)
     q, v = model.random_state(rng, samples)
-    parts = [("random", q)]
+    parts, stops = [("random", q)], StopLaw(model)
     few = max(2, samples // 16)
     if not model.constrained:
         parts.append(("neutral", np.tile(model.neutral(), (2, 1))))
         parts.append(("at limits", _at_limits(model, rng, few)))
         parts.append(("near singular", _near_singular(model, rng, few)))
         if "jump" in model.effects:
-            q_at_rest = model.random_state(rng, few)[0]
-            parts.append((_AT_REST, StopLaw(model).onto(q_at_rest, np.ones((few, model.nv), dtype=bool))))
+            at = model.random_state(rng, 4 * few if stops else few)[0]
+            parts.append((_AT_REST, stops.onto(at, np.ones((len(at), model.nv), dtype=bool))))
     q = np.concatenate([x for _, x in parts])
     v = np.concatenate([v, rng.standard_normal((len(q) - samples, model.nv))])
     a, tau = rng.standard_normal((2, len(q), model.nv))
     kinds = tuple(kind for kind, x in parts for _ in x)
     resting = [k for k, kind in enumerate(kinds) if kind == _AT_REST]
-    v[resting[:1]], v[resting[1:], ::2] = 0.0, 0.0
+    v[resting[:1]], v[resting[1:], ::2], v[np.ix_(resting, stops.which)] = 0.0, 0.0, 0.0
     return States(q, v, a, tau, kinds)
 
 
