@@ -57,8 +57,8 @@ WITHOUT_ENERGY = ("force.frame",)
 #: Gates of runs that no engine here has; `tests.test_trained_engines` goes through them where one is.
 ELSEWHERE = ("newton", "remote runs of joints")
 #: Refusals that no check finds needed. Whether motions that a coupler leaves still tell the tree's base parameters
-#: depends on the axes that it binds; they do in these examples. Terms of a system are the same beside a stop. What rests
-#: on a stop has no event, a torque that holds it is one of many, and torques that are identified are those off stops.
+#: depends on the axes that it binds; they do in these examples. Terms of a system are the same beside a stop. What
+#: rests on a stop has no event; a torque that holds it is one of many; torques that are identified are off stops.
 NEEDLESS = {"base parameters": ("coupler", "coupler.several"), "derivation": ("written.stop",)}
 NEEDLESS |= dict.fromkeys(("runs without phases", "equilibrium", "identification"), ("joint.stop",))
 
