@@ -23,9 +23,8 @@ from mbkit.errors import LoadError, ModelError, UnsupportedError
 from mbkit.load.urdf_reader import BASE_JOINT, DYNAMICS, Snapper, UrdfFile, unbounded
 from mbkit.load.xml_reader import reserved, unused
 from mbkit.model import Body, Joint, Model, ModelBuilder, kind_of
-from mbkit.model.elements.kinds import joint_types
+from mbkit.model.elements.kinds import AS_LIMITS, joint_types
 from mbkit.model.elements.paths import Path
-from mbkit.model.stops import AS_LIMITS
 from mbkit.model.validation import body_fault, listing
 
 _AXES: Final = dict(zip("XYZ", np.eye(3), strict=True))

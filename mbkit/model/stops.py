@@ -22,8 +22,6 @@ HITS: Final = "hits"
 RESTS: Final = "comes to rest on"
 #: Distance from a bound, relative to it and in rad or m where it is smaller, that is rounding of a coordinate.
 TOUCHING: Final = 64 * EPS
-#: Note on files.
-AS_LIMITS: Final = "joint stops come back as limits: load the file with stops=True; set_joint gives restitution"
 
 
 class StopLaw:

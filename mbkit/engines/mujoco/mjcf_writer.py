@@ -21,9 +21,8 @@ from mbkit.load.mjcf import JOINT_NUMBERS
 from mbkit.load.mjcf_reader import KINDS
 from mbkit.methods.simulation_settings import Servo, Settings
 from mbkit.model import Joint, Model
-from mbkit.model.elements.kinds import EFFECTS
+from mbkit.model.elements.kinds import AS_LIMITS, EFFECTS
 from mbkit.model.elements.paths import Path
-from mbkit.model.stops import AS_LIMITS
 
 _TYPES: Final = tuple(KINDS)
 #: Largest number that MuJoCo takes.

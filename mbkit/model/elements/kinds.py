@@ -34,6 +34,8 @@ EFFECTS: Final[Mapping[str, str]] = MappingProxyType(
     | {"stop": "joint stops"}
     | {"t": "terms that depend on the time"}
 )
+#: Note on files.
+AS_LIMITS: Final = "joint stops come back as limits: load the file with stops=True; set_joint gives restitution"
 _OF_TYPES: Final = "joint_type."
 
 

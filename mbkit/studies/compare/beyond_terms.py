@@ -74,10 +74,8 @@ def _largest_jump(model: Model, forces: Array) -> Finding | None:
 def _limits(model: Model) -> Finding | None:
     # What the same joints have stands together, and a finer kind with its own.
     there = [x for x in that_do("bound", "joints") if x in model.acts and x.rpartition(".")[0] not in PART_KINDS]
-    stops = {*model.acts.get("joint.stop", ())}
-    off = {x: tuple(n for n in model.acts[x] if x != "joint.limit" or n not in stops) for x in there}
-    alike = by_key((off[x], kind(x).words.rpartition("has ")[2]) for x in there)
-    parts = [f"{', '.join(some)} at {counted(len(joints), 'joint')}" for joints, some in alike.items() if joints]
+    alike = by_key((model.acts[x], kind(x).words.rpartition("has ")[2]) for x in there)
+    parts = [f"{', '.join(some)} at {counted(len(joints), 'joint')}" for joints, some in alike.items()]
     if not parts:
         return None
     every = tuple(dict.fromkeys(name for some in alike for name in some))
