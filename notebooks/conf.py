@@ -91,10 +91,13 @@ def _mathml(translator: Any, node: nodes.Element, *, block: bool) -> None:
     """Write a formula as MathML, which a browser shows without a script and a screen reader reads."""
     # The converter knows one name for lines that are aligned.
     tex = node.astext().replace("{aligned}", "{align*}").replace("{align}", "{align*}")
+    # It knows no column of lines. They begin at the left, as wide ones run out of the page.
+    tex = tex.replace("\\begin{gathered}", "\\begin{array}{l}").replace("\\end{gathered}", "\\end{array}")
     if block and "\\begin{" not in tex and "\\\\" in tex:
         tex = f"\\begin{{align*}}{tex}\\end{{align*}}"
     text = convert(tex, display="block" if block else "inline")
-    # The converter sets no space beside the name of a function.
+    # The converter sets no space beside the name of a function, and takes ⟂ for one letter.
+    text = text.replace("<mi>&#x027C2;</mi>", "<mo>&#x027C2;</mo>")
     text = _FUNCTION.sub(r'<mspace width="0.17em" />\1<mspace width="0.17em" />', text)
     translator.body.append(f'<div class="math">{text}</div>' if block else text)
     raise nodes.SkipNode
