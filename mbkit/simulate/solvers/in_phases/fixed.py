@@ -195,7 +195,8 @@ class _Members:
         its: Any = slice(None) if fits.all() else np.flatnonzero(fits)
         for to, x in ((record.q, q), (record.v, v)) if fits.any() else ():
             _windows(to, n)[members[its] * (steps + 1) + k[its]] = x[its].reshape(-1, n * x.shape[2])
-        for i in np.flatnonzero(~fits).tolist():
+        wanted = dense | (record.kept.searchsorted(k + count, side="right") > record.kept.searchsorted(k, side="right"))
+        for i in np.flatnonzero(~fits & wanted).tolist():
             first, last = int(k[i]) + 1, int(k[i] + count[i])
             saved = slice(first, last + 1) if dense else record.rows(first, last)
             which: Any = slice(1, last - first + 2) if dense else record.kept[saved] - first + 1
