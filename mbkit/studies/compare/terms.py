@@ -74,7 +74,7 @@ def states(model: Model, samples: int, seed: int) -> States:
     a, tau = rng.standard_normal((2, len(q), model.nv))
     kinds = tuple(kind for kind, x in parts for _ in x)
     resting = [k for k, kind in enumerate(kinds) if kind == _AT_REST]
-    v[resting[:1]], v[resting[1:], ::2], v[np.ix_(np.array(resting), stops.which)] = 0.0, 0.0, 0.0
+    v[resting[:1]], v[resting[1:], ::2], v[np.ix_(np.array(resting, dtype=int), stops.which)] = 0.0, 0.0, 0.0
     return States(q, v, a, tau, kinds)
 
 
