@@ -19,6 +19,7 @@ import pytest
 import mbkit as mb
 from mbkit.cli import cli
 from mbkit.codegen.c_source import export_c
+from tests.scenes import METHODS
 
 BOOK = Path(__file__).resolve().parent.parent / "notebooks"
 PAGES = sorted(p for p in BOOK.rglob("*.md") if not {"_build", ".ipynb_checkpoints"} & {*p.parts})
@@ -267,6 +268,21 @@ def own_integrators_refuse_dry_friction() -> bool:
     return refuses(run, "dry friction")
 
 
+def methods_take_stops() -> bool:
+    """A joint that is pushed onto its stop at 0.1 rad rests there, by every method that this machine has."""
+    model = arm(lower=-1.0, upper=0.1, stops=True).build()
+    for method in METHODS.values():
+        engine = (method.engines or ("lagrangian",))[0]
+        settings = {} if method.kind == "adaptive" else {"dt": 1e-2}
+        more = {"torque": [5.0], "doubt": False} | settings
+        run = partial(mb.simulate, mb.dynamics(model, engine), [0.0], [1.0], 0.2, method.name, **more)
+        if engine != "lagrangian":
+            assert refuses(run, "joint 'pivot' has stops"), method.name
+        else:
+            assert run().q[-1] == 0.1, method.name
+    return True
+
+
 CLAIMS: dict[tuple[str, str], Callable[[], Any]] = {
     ("howto/wrenches_and_loads.md", "loads of a mechanism with loops need the force τ too"): loads_of_a_loop,
     ("howto/wrenches_and_loads.md", "Forces given by functions are refused here"): lambda: refuses(
@@ -292,6 +308,7 @@ CLAIMS: dict[tuple[str, str], Callable[[], Any]] = {
     ("howto/dry_friction.md", "Integrators of MuJoCo and Drake themselves are refused"): (
         own_integrators_refuse_dry_friction
     ),
+    ("howto/joint_stops.md", "Every method but the integrators of MuJoCo and Drake takes stops"): methods_take_stops,
 }
 
 
