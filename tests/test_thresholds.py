@@ -29,6 +29,7 @@ from mbkit.engines.applications import random_states
 from mbkit.engines.constrained import singular_pose
 from mbkit.engines.constraint_manifold import Manifold
 from mbkit.engines.elements import jumps
+from mbkit.engines.elements.stop_impacts import after_impacts
 from mbkit.errors import InputError, MbkitError, ModelError, NumericalError, nearest
 from mbkit.lagrangian import printer
 from mbkit.lagrangian.continua import integrals, ritz
@@ -42,6 +43,7 @@ from mbkit.model import base_parameters, manifold, validation
 from mbkit.model.builder import ArgumentReader
 from mbkit.model.elements import beams, editing, motion_laws
 from mbkit.model.quaternions import FLOATS
+from mbkit.model.stops import StopLaw
 from mbkit.show import meshes
 from mbkit.simulate import checks, stiffness_measure, time_grid
 from mbkit.simulate.solvers import auto, step_attempts, trajectory_record, vector_field
@@ -346,6 +348,30 @@ def drawn_anywhere(k: int) -> bool:
     return (draws(k) or [])[-1:] == [manifold.random_state(model, rng, None)[0] for _ in range(k + 1)][-1:]
 
 
+def hit_in_a_row(*speeds: float) -> np.ndarray:
+    """Return the relative velocities of balls in a row, of which each comes towards the next with one of the speeds."""
+    own = {"kind": "prismatic", "mass": 1.0, "axis": (1, 0, 0)}
+    stopped = own | {"lower": 0.0, "stops": True, "restitution": 1.0}
+    dyn = mb.dynamics(chain(own, *(stopped for _ in speeds), gravity=(0, 0, 0)).build(), "pinocchio")
+    v = np.array([[speeds[0], *(-x for x in speeds)]])
+    return after_impacts(dyn._jumps, dyn, np.zeros(v.shape), v).v[0]
+
+
+def bounces(height: float) -> bool:
+    model = slider(gravity=(-9.81, 0, 0), lower=0.0, stops=True, restitution=1.0).build()
+    run = mb.simulate(mb.dynamics(model, "pinocchio"), [height], [0.0], 1e-5, method="rk4", dt=1e-5)
+    return all("hits" in x.name for x in run.events)
+
+
+def hit_at_once(apart: float) -> bool:
+    """Return whether two sliders that reach their stops so many seconds apart do so at one time."""
+    own = {"kind": "prismatic", "mass": 1.0, "axis": (0, 0, 1), "parent": "world", "stops": True}
+    links = [own | {"lower": -0.5 * 9.81 * t**2} for t in (0.3, 0.3 + apart)]
+    dyn = mb.dynamics(chain(*links).build(), "pinocchio")
+    run = mb.simulate(dyn, [0.0, 0.0], [0.0, 0.0], 0.4, method="dop853", rtol=1e-12)
+    return len({x.t for x in run.events}) == 1
+
+
 def compiles_moreau(responses: int) -> bool:
     needs = Stub(friction=True, stops=False)
     model = Stub(effects={"jump"}, needs=needs, constrained=True, nv=responses)
@@ -609,6 +635,19 @@ DECIDES: dict[str, tuple[Callable[[Any], object], Any, Any]] = {
         5e-8,
         2e-7,
     ),
+    "engines.elements.stop_impacts:_FIRST": (lambda x: hit_in_a_row(1.0, x)[0] < -0.1, 5e-7, 5e-6),
+    "engines.elements.stop_impacts:_MAX_IMPACTS": (
+        lambda x: hit_in_a_row(1.0, *np.zeros(x)).sum() > 0.999,
+        150,
+        210,
+    ),
+    "model.stops:TOUCHING": (
+        lambda x: bool(StopLaw(slider(lower=0.0, stops=True).build()).against(np.array([x]))),
+        32 * EPS,
+        128 * EPS,
+    ),
+    "simulate.solvers.in_phases.phases:FLAT": (bounces, 5e-12, 5e-11),
+    "simulate.solvers.in_phases.phases:SIMULTANEOUS": (hit_at_once, 5e-13, 5e-12),
     "simulate.solvers.in_phases.moreau:_MAX_RESPONSES": (compiles_moreau, 200, 201),
     "simulate.solvers.in_phases.phases:POSE_ROUNDING": (lambda x: phases.slow(np.ones(1))[0] > x, 5e-10, 5e-9),
     "simulate.solvers.in_phases.phases:_FADED": (

@@ -53,7 +53,7 @@ class StopLaw:
                 continue
             leader = joint.mimic.joint if joint.mimic else joint.name
             ratio, offset = (joint.mimic.ratio, joint.mimic.offset) if joint.mimic else (1.0, 0.0)
-            for k, suffix in enumerate(joint.type.velocity_suffixes if ratio else ()):
+            for k in range(joint.type.nv if ratio else 0):
                 i = layout.v[leader].start + k
                 self.places[i] = layout.q[leader].start + k
                 for side, bound in enumerate((joint.lower[k], joint.upper[k])):
@@ -63,7 +63,8 @@ class StopLaw:
                     inner = at > self.bounds[0, i] if own == 0 else at < self.bounds[1, i]
                     if inner:
                         self.bounds[own, i], self.restitution[own, i] = at, e[k]
-                        self.names[own, i] = f"{joint.name}{suffix}", ("lower", "upper")[side]
+                        name = joint.name if joint.mimic else model.coordinate_names[self.places[i]]
+                        self.names[own, i] = name, ("lower", "upper")[side]
         finite = np.isfinite(self.bounds)
         self.which: NDArray[np.bool_] = np.asarray(finite.any(axis=0))
         self.room = np.where(finite, TOUCHING * np.maximum(1.0, np.abs(self.bounds)), 0.0)

@@ -495,9 +495,8 @@ class Phases:
             size = np.maximum(1.0, np.abs(bound))
             ends = bounces & (side * a < 0) & (new**2 <= 2 * np.abs(a) * FLAT * size)
             if ends.any():
-                delays = np.where(
-                    ends & hits & (e < 1), 2 * np.abs(new) / np.where(ends, np.abs(a) * (1 - e), 1.0), 0.0
-                )
+                series = ends & hits & (e < 1)
+                delays = np.where(series, 2 * np.abs(new) / np.where(series, np.abs(a) * (1 - e), 1.0), 0.0)
                 _rows(out)[rows], _, left = over(self._own, own, states, new, ends)
         # What rows hold together with a stop rests too.
         out = self.stopped(rubbed, t, q, out, out == 0)
