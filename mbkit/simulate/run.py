@@ -117,7 +117,9 @@ def simulate(
     Trajectory
         Of a run that diverged, the states up to then, with `stats.ended`, `stats.reached` and `stats.message`, and an
         `MbkitWarning`. In a batch the others go on. With dry friction `events` has where each of them
-        stops, lets go or turns, and a run in which that cannot be decided ends there.
+        stops, lets go or turns, with joint stops where it hits, leaves or comes to rest on one, and a run in which that
+        cannot be decided ends there. A fixed step h does not see that a joint is beyond its stop within the step alone,
+        by up to a h²/8; an adaptive method does.
 
     Raises
     ------
