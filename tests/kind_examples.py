@@ -203,6 +203,9 @@ def size_of(type_: str) -> int:
 class Arm:
     """Joints and bodies told twice: to a builder, and to the plain case."""
 
+    #: The lower bound of a stop that its joint is at.
+    HERE = "here"
+
     def __init__(self, name: str, *, gravity: bool = False, rng: np.random.Generator | None = None) -> None:
         weight = GRAVITY if gravity else 0 * GRAVITY
         self.builder = mb.ModelBuilder(name.replace(".", "_").replace(" ", "_"), gravity=weight)
@@ -232,6 +235,11 @@ class Arm:
         more = ({"axis": one} | ({"axis2": two} if two is not None else {})) if named else {}
         more |= {"pitch": pitch} if pitch else {}
         more |= {"mimic": mimic} if mimic else {}
+        free = 0 if mimic or type_ == "fixed" else len(stack)
+        k = np.arange(n, n + free)
+        q = 0.25 - 0.1 * (k % 5) if self.rng is None else self.rng.uniform(-0.8, 0.8, free)
+        rests = numbers.get("lower") == self.HERE
+        numbers |= {"lower": float(q[0])} if rests else {}
         self.builder.add_body(body, mass=mass, com=com, inertia=inertia)
         self.builder.add_joint(joint, type_, parent=parent, child=body, **where, **more, **numbers)
         for i, (kind, axis) in enumerate(stack):
@@ -253,16 +261,15 @@ class Arm:
         if mimic:
             leader, ratio, offset = self.link[mimic[0]], *mimic[1:]
             rows[0], start[0] = ratio * c.G[leader], ratio * c.c[leader] + offset
-        free = 0 if mimic or type_ == "fixed" else len(stack)
         c.G = np.block([[c.G, np.zeros((links, free))], [rows, np.eye(len(stack), free)]])
         c.c = np.append(c.c, start)
-        k = np.arange(n, n + free)
-        q = 0.25 - 0.1 * (k % 5) if self.rng is None else self.rng.uniform(-0.8, 0.8, free)
         c.q, c.v = np.append(c.q, q), np.append(c.v, np.where(k % 2, -0.4, 0.5) + 0.07 * k)
         if free:
             self.joints.append((joint, type_, n))
         if numbers:
-            self.with_part(of_joint(joint, type_, links, numbers))
+            part = of_joint(joint, type_, links, numbers)
+            part.stops = ((links, 1.0, numbers["lower"]),) if rests else ()
+            self.with_part(part)
 
     def next(self, type_: str, parent: str, **numbers: Any) -> str:
         """Add the joint and the body with the next number, and return the body's name."""
@@ -326,11 +333,9 @@ def with_joint(type_: str = "revolute", **numbers: Any) -> Callable[[str], Examp
 def _on_a_stop(name: str) -> Example:
     """An arm whose last joint rests on its lower stop, into which its load and the other velocities push it."""
     a = arm(name)
-    bound = 0.25 - 0.1 * a.case.n
     place = {"mass": 0.7, "com": (-0.3, -0.2, -0.1), "inertia": (0.1, 0.2, 0.25), "axes": ((0, 0.6, 0.8),)}
-    a.add("x", "revolute", "b2", "x", **place, lower=bound, stops=True, restitution=0.3)
-    (own,) = a.case.parts
-    own.stops, a.case.v = ((a.link["x"], 1.0, bound),), np.append(np.abs(a.case.v[:-1]), 0.0)
+    a.add("x", "revolute", "b2", "x", **place, lower=Arm.HERE, stops=True, restitution=0.3)
+    a.case.v = np.abs(a.case.v)
     return a.built(("joint stops",))
 
 

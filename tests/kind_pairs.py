@@ -61,9 +61,11 @@ SOUND = ("right", "refused", "left out", "not asked")
 #: Kinds of a system that was written as energies, which has no parts beside them.
 WRITTEN = ("energies", "written.row", "written.speed", "written.t")
 NUMBERS_OF = {f"joint.{k}": x for k, x in NUMBERS.items()} | {"joint.stiction": STICTION}
+NUMBERS_OF["joint.stop"] = NUMBERS["limit"] | {"stops": True}
 #: What a kind is besides.
 IMPLIED = {
     "joint.stiction": "joint.friction",
+    "joint.stop": "joint.limit",
     "coupler.curve": "coupler",
     "coupler.several": "coupler",
     "force.of_time": "force.joint",
@@ -176,19 +178,20 @@ PAPER = Plan((Spot(kinds=frozenset({"force.of_time"})),), ("loop.distance", "no_
 
 def built(name: str, plan: Plan, seed: int) -> Example:
     """Return the example of a plan, in a state in which rows are apart from each other and dry friction slides on."""
-    tries = (_built(name, plan, np.random.default_rng([SEED, seed, k])) for k in range(60))
+    # Where what rests on stops leaves no motion, these are far.
+    tries = (_built(name, plan, np.random.default_rng([SEED, seed, k]), rest=k < 30) for k in range(60))
     out = next(x for x in tries if x)
     return kind_examples.on_paper(out) if plan.paper else out
 
 
-def _built(name: str, plan: Plan, rng: np.random.Generator) -> Example | None:
+def _built(name: str, plan: Plan, rng: np.random.Generator, *, rest: bool = False) -> Example | None:
     plan = plan.whole
     a, bodies, sites = Arm(name, gravity="gravity" in replace(plan, paper=False).acts, rng=rng), ["world"], []
     for spot in sorted(plan.spots, key=lambda s: "mimic" in s.kinds):
         # A tree now and then.
         parent = bodies[-1] if rng.random() < 0.75 else str(rng.choice(bodies))
         k = len(a.link)
-        _add(a, spot, parent, rng)
+        _add(a, spot, parent, rng, rest=rest)
         bodies.append(f"b{k}")
         sites += [(x, k, spot) for x in sorted(spot.kinds & {*PARTS} - {"mimic"})]
     leads = [j for j, s in zip(a.link, sorted(plan.spots, key=lambda s: "mimic" in s.kinds), strict=True) if s.leads]
@@ -206,10 +209,12 @@ def _built(name: str, plan: Plan, rng: np.random.Generator) -> Example | None:
     return _sliding(a, rng)
 
 
-def _add(a: Arm, spot: Spot, parent: str, rng: np.random.Generator) -> None:
+def _add(a: Arm, spot: Spot, parent: str, rng: np.random.Generator, *, rest: bool) -> None:
     k, several = len(a.link), spot.type in SEVERAL and spot.type != "ball"
     given = {f: x for name in sorted(spot.kinds) for f, x in NUMBERS_OF.get(name, {}).items()}
-    numbers = {f: [x] * int(JOINT_TYPES[spot.type].nv) if several else x for f, x in given.items()}
+    numbers = {f: [x] * int(JOINT_TYPES[spot.type].nv) if several and x is not True else x for f, x in given.items()}
+    if rest and "joint.stop" in spot.kinds and spot.type in ONE and not any(map(binds, spot.kinds)):
+        numbers["lower"] = Arm.HERE
     if spot.type == "free":
         # A quaternion has no limits.
         numbers |= {
@@ -227,7 +232,7 @@ def _add(a: Arm, spot: Spot, parent: str, rng: np.random.Generator) -> None:
 def _sliding(a: Arm, rng: np.random.Generator) -> Example | None:
     x = a.built()
     c = x.plain
-    J = c.held(c.t, c.q)
+    J = np.vstack([c.held(c.t, c.q), c.touched(c.q, 0 * c.v)])
     if len(J) and (len(J) > c.n or np.linalg.svd(J, compute_uv=False)[-1] < 0.1):
         return None
     rub = [k for j in x.model.joints if np.any(j.friction) for k in range(a.link[j.name], a.link[j.name] + j.type.nv)]

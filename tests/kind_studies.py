@@ -801,3 +801,30 @@ def _sticking(x: Example, folder: Path) -> Told:
     run = mb.simulate(engine(x.name), sliding.q, sliding.v, DURATION, "rk4", STEP, torque=sliding.tau, t0=x.t)
     q1, v1 = x.state(end)
     return max(worst, off(run.q[-1], q1), off(run.v[-1], v1))
+
+
+@column("use of runs", "impact on a stop", close=1e-8)
+def _impact_on_a_stop(x: Example, folder: Path) -> Told:
+    """Joint x comes to its stop within a run, whose impulse turns its velocity around and jerks the others."""
+    c = x.plain
+    if "joint.stop" not in x.model.acts:
+        raise NotAskedError("no stops")
+    (row,), e = c.touched(c.q, c.v), 0.3
+    bare = replace(c, parts=[replace(p, stops=()) for p in c.parts])
+    start = replace(x, plain=replace(bare, q=c.q + 1e-3 * row, v=c.v - 0.2 * row))
+    at = scipy.optimize.brentq(lambda t: row @ (start.flow([t])[-1][: c.n] - c.q), 1e-4, DURATION, xtol=1e-15)
+    q, v = np.split(start.flow([at])[-1], 2)
+    jerk = np.linalg.solve(c.mass_matrix(q), row)
+    after = replace(bare, q=q, v=v - (1 + e) * (row @ v) / (row @ jerk) * jerk, t=c.t + at)
+    q1, v1 = x.state(replace(x, plain=after).flow([DURATION - at])[-1])
+    worst = 0.0
+    for method in ("rk4", "rk853", "auto", "gauss4", "dop853", "taylor", "implicit_midpoint"):
+        # The midpoint's error falls with the square of its step.
+        step = {"rk4": STEP, "gauss4": STEP, "implicit_midpoint": STEP / 64}.get(method)
+        given = DURATION, method, step
+        run = mb.simulate(engine(x.name), start.q, start.v, *given, torque=x.tau, t0=x.t, save=None)
+        (hit,) = run.events
+        if hit.name != "x hits its lower stop":
+            raise AssertionError(hit.name)
+        worst = max(worst, off(run.q[-1], q1), off(run.v[-1], v1), off(hit.t, c.t + at))
+    return worst

@@ -300,12 +300,13 @@ class Case:
         return np.vstack([J, *(p.speeds(self, q) for p in self.parts if p.speeds is not None)])
 
     def allowed(self, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return the velocities nearest to these that all rows allow."""
-        J = self.held(t, q)
+        """Return the velocities nearest to these that all rows allow, zero at stops."""
+        J, at = self.held(t, q), self.touched(q, 0 * v)
         drift = [] if not any(p.rows for p in self.parts) else np.imag(self.rows(t + 1j * _STEP, q.astype(complex)))
         speeds = [p.speed for p in self.parts if p.speeds is not None for _ in p.speeds(self, q)]
-        b = np.concatenate([-np.asarray(drift) / _STEP, speeds])
-        return v - np.linalg.pinv(J) @ (J @ v - b) if len(J) else v
+        J, b = np.vstack([J, at]), np.concatenate([-np.asarray(drift) / _STEP, speeds, np.zeros(len(at))])
+        # What rests does so to the last bit.
+        return np.where(at.any(axis=0), 0.0, v - np.linalg.pinv(J) @ (J @ v - b)) if len(J) else v
 
 
 # Parts

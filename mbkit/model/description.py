@@ -507,7 +507,7 @@ class Description:
     def effort_limits(self) -> Array:
         """Largest forces of the actuators by amount, shape (nv,), N or Nm; infinite where there is no limit.
 
-        They do not act in a run.
+        They act in runs with ``saturate=True`` alone.
 
         Examples
         --------

@@ -43,8 +43,8 @@ _OF_TYPES: Final = "joint_type."
 class Needs:
     """One flag per feature; True where the description has it.
 
-    Limits are data, off in every engine. `forces` are those given by functions and what holds weights; their
-    parts do not count as springs and dampers.
+    Limits are data, off in every engine, unless they are `stops`. `forces` are those given by functions and what holds
+    weights; their parts do not count as springs and dampers.
     """
 
     gravity: bool
