@@ -382,13 +382,20 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         if q.ndim > 1 or v.ndim > 1 or tau.ndim > 1:
             raise InputError(f"constraint_law: expected one state, got shapes {q.shape}, {v.shape}, {tau.shape}")
         pushed: Array = tau + self._elements.force(self, q, v) if self.model.forces else tau
-        with self._lock, heard_warnings():
-            if "jump" in self.model.effects and not self._soft_jumps:
-                _, pushed = self._exact_friction(q, v, pushed, self._forward_dynamics)
+
+        def held(q: Array, v: Array, tau: Array) -> ConstraintLaw:
             with self._with_loops():
                 b = self._set(q, v)
-                self._accelerated(pushed)
-                return self._law(b, q, v, pushed)
+                self._accelerated(tau)
+                return self._law(b, q, v, tau)
+
+        with self._lock, heard_warnings():
+            if "jump" not in self.model.effects or self._soft_jumps:
+                return held(q, v, pushed)
+            # What rests between rigid loops is held by other forces.
+            rigid, _ = self._exact_friction(q, v, pushed, lambda *state: held(*state).rigid)
+            _, pushed = self._exact_friction(q, v, pushed, self._forward_dynamics)
+            return replace(held(q, v, pushed), rigid=rigid)
 
     def _exact_friction(self, q: Array, v: Array, tau: Array, own: Callable[..., Array]) -> tuple[Array, Array]:
         """Return the accelerations of exact dry friction beside those of `own`, and τ with its forces."""
