@@ -26,7 +26,7 @@ def closed(**numbers) -> tuple[mb.Model, np.ndarray, np.ndarray]:
     LIMBS["loop.point"](a, Site(body="world"))
     x = a.built()
     b = mb.ModelBuilder.of(x.model)
-    b.set_joint("j0", **({"lower": x.q[0], "stops": True} if not numbers else numbers))
+    b.set_joint("j0", **(numbers or {"lower": x.q[0], "stops": True}))
     return b.build(), x.q, x.tau
 
 
