@@ -238,6 +238,7 @@ def test_a_description_says_that_its_limits_act() -> None:
     [
         ({"stops": True}, "stops without limits; give lower, upper or both"),
         ({"lower": 0.3, "upper": 0.3, "stops": True}, "stops of zero width"),
+        ({"lower": 0.0, "upper": 1e-15, "stops": True}, "leave x no room"),
         ({"lower": 0.4, "upper": 0.3, "stops": True}, "lower limit [0.4] above upper limit [0.3]"),
         ({"lower": 0.0, "stops": True, "restitution": 1.5}, "restitution: expected numbers from 0 to 1, got [1.5]"),
         ({"lower": 0.0, "stops": True, "restitution": -0.1}, "restitution: expected numbers from 0 to 1, got [-0.1]"),
@@ -260,6 +261,17 @@ def test_stops_of_several_joints_leave_room() -> None:
         chain(links[0], links[1] | follower | {"mimic": ("j0", mb.Parameter("r", 2.0), 0.1)}).build()
     with pytest.raises(ModelError, match="stops on a ball joint, which has no coordinate with such a rate"):
         chain(links[0] | {"kind": "ball", "axis": None, "stops": True}).build()
+
+
+@pytest.mark.parametrize("method", ["rk853", "rk4", "moreau"])
+def test_stops_of_a_joint_that_follows_nothing_hold_nothing(method: str) -> None:
+    link = {"mass": 1.0, "com": (0.1, 0, 0), "inertia": (1, 1, 1), "axis": (0, 1, 0)}
+    model = chain(link, link | {"lower": -0.1, "upper": 0.1, "stops": True, "mimic": ("j0", 0.0, 0.0)}).build()
+    runs = [
+        mb.simulate(mb.dynamics(x, "lagrangian"), [0.3], [0.1], 0.3, method) for x in (model, model.without("stops"))
+    ]
+    np.testing.assert_allclose(runs[0].q[-1], runs[1].q[-1], rtol=1e-8)
+    assert not runs[0].events
 
 
 def test_a_start_beyond_a_stop_is_refused_with_the_amount_and_projected() -> None:

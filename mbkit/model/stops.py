@@ -144,7 +144,8 @@ def stop_faults(model: Description) -> Iterator[str]:
     if faulty:
         return
     law = StopLaw(model)
-    for i in np.flatnonzero(law.bounds[0] >= law.bounds[1]).tolist():
+    # Between stops that are touched at once nothing moves either.
+    for i in np.flatnonzero(law.bounds[1] - law.bounds[0] <= law.room.sum(axis=0)).tolist():
         names = " and ".join(law.names[side, i][0] for side in (0, 1))
         yield f"stops of {names} leave {model.velocity_names[i]} no room; lock(...) holds a joint that nothing moves"
 

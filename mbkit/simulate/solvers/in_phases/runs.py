@@ -80,7 +80,7 @@ class _Friction:
                 # The solver tells that there is no state.
                 return 1.0
             row = force(max(k, int(np.searchsorted(stops, t, side="left"))))
-            out = float(phases.margins(phase, t, q, v, row).min())
+            out = float(phases.margins(phase, t, q, v, row).min(initial=1.0))
             return max(out, EPS) if t == begun else out
 
         parts = 2 if self._timed and phase.still.any() else 1
