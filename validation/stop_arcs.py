@@ -241,11 +241,30 @@ class Arc:
 
 def first_root(margin: list[Any], h: Any) -> Any:
     """Return where within h a polynomial, positive at first, has its first zero; None where there is none."""
+    slope = [x * (len(margin) - 1 - k) for k, x in enumerate(margin[:-1])] or [mp.mpf(0)]
     at = [h * k / PLACES for k in range(PLACES + 1)]
     for a, b in itertools.pairwise(at):
-        if mp.polyval(margin, b) < 0:
-            return mp.findroot(lambda s: mp.polyval(margin, s), (a, b), solver="anderson", tol=mp.mpf(10) ** -36)
+        end = b
+        if mp.polyval(slope, a) < 0 < mp.polyval(slope, b):
+            # It turns in between, and may have been below zero.
+            end = _root(slope, a, b)
+        if mp.polyval(margin, end) < 0:
+            return _root(margin, a, end)
     return None
+
+
+def _root(polynomial: list[Any], a: Any, b: Any) -> Any:
+    """Return the zero between a and b, where signs differ: Newton's method, kept within them."""
+    rises, x = mp.polyval(polynomial, b) > 0, (a + b) / 2
+    for _ in range(20 * DIGITS):
+        f, slope = mp.polyval(polynomial, x, derivative=True)
+        a, b = (a, x) if (f > 0) == rises else (x, b)
+        last, x = x, x - f / slope if slope else a
+        if abs(x - last) < mp.mpf(10) ** (4 - DIGITS):
+            return x
+        if not a < x < b:
+            x = (a + b) / 2
+    raise ValueError(f"no zero found between {a} and {b}")
 
 
 def run(

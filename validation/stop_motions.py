@@ -428,12 +428,12 @@ def measured(name: str) -> dict[str, Any]:
     def numbers(e: Event) -> list[Any]:
         return [e.t, *e.q, *e.before, *e.after, e.lost]
 
+    # Of bounces without end the first.
+    events, again = ([e for e in x if e.kind != "hits" or abs(e.before[e.joint]) > 1e-4] for x in (events, again))
     pairs = [([*q, *v, t], [*end[0], *end[1], end[2]]), *zip(map(numbers, events), map(numbers, again), strict=True)]
     off = max(abs(x - y) for a, b in pairs for x, y in zip(a, b, strict=True))
 
-    # Of bounces without end the first.
-    told = [e for e in events if e.kind != "hits" or abs(e.before[e.joint]) > 1e-4]
-    return {"events": _told(told), "end": [_text(q), _text(v), _text(t)], "off": float(off)}
+    return {"events": _told(events), "end": [_text(q), _text(v), _text(t)], "off": float(off)}
 
 
 def kept(name: str) -> tuple[list[Event], tuple[list[float], list[float], float]]:
