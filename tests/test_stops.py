@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -400,3 +401,16 @@ def test_bounces_that_a_hit_elsewhere_wakes_do_not_end_twice() -> None:
             last = {name: max(x.t for x in run.events if x.name == name) for name in {x.name for x in run.events}}
             assert last["j0 comes to rest on its upper stop"] >= last["j0 hits its upper stop"]
         assert [x.name for x in runs[0].events] == [x.name for x in runs[1].events]
+
+
+def test_a_run_with_impacts_has_its_energies_when_it_is_loaded(tmp_path: Path) -> None:
+    model = slider(lower=0.0, stops=True, restitution=0.5, axis=(0, 0, 1)).build()
+    run = mb.simulate(mb.dynamics(model, "lagrangian"), [1.0], [0.0], 1.0, "rk853", rtol=1e-10)
+    run.save(tmp_path / "run.npz")
+    again = mb.Trajectory.load(tmp_path / "run.npz", model)
+    assert [x.energy_change for x in again.events] == [x.energy_change for x in run.events]
+    assert [x.before.tolist() for x in again.events if x.before is not None] == [
+        x.before.tolist() for x in run.events if x.before is not None
+    ]
+    assert again.events[0].before is not None
+    np.testing.assert_array_equal(again.work(), run.work())

@@ -289,6 +289,8 @@ class Trajectory(RunData):
             arrays |= {"rows": acted.rows} | ({} if acted.starts is None else {"starts": acted.starts})
         about["events"] = [(x.name, float(x.t), None if x.member is None else int(x.member)) for x in self.events]
         arrays |= {f"event_{name}": np.array([getattr(x, name) for x in self.events]) for name in "qv"}
+        arrays["event_before"] = np.array([np.nan * x.v if x.before is None else x.before for x in self.events])
+        arrays["event_energy"] = np.array([x.energy_change for x in self.events])
         arrays["about"] = np.array(json.dumps(about))
         with writing(path), open(path, "wb") as file:
             np.savez_compressed(file, **arrays)
@@ -317,8 +319,12 @@ class Trajectory(RunData):
             known = Stats(**stats | {"doubts": tuple(stats["doubts"]), "saturated": clipped})
             parts = arrays["t"], arrays["q"], arrays["v"], model, about["method"], about["engine"], known
             digest, acting = about["digest"], about.get("wrenches")
-            listed = zip(about.get("events", ()), arrays.get("event_q", ()), arrays.get("event_v", ()), strict=True)
-            hits = tuple(Hit(name, t, q, v, member) for (name, t, member), q, v in listed)
+            told, event_v = about.get("events", ()), arrays.get("event_v", np.zeros(0))
+            # Files of before stops have no impacts.
+            befores = [None if np.isnan(x).any() else x for x in arrays.get("event_before", np.nan * event_v)]
+            energies = arrays.get("event_energy", np.zeros(len(told))).tolist()
+            listed = zip(told, arrays.get("event_q", ()), event_v, befores, energies, strict=True)
+            hits = tuple(Hit(name, t, q, v, i, before, e) for (name, t, i), q, v, before, e in listed)
         except (OSError, EOFError, ValueError, KeyError, TypeError) as error:
             raise LoadError(f"{path}: expected a run that Trajectory.save wrote ({error})") from None
         if digest != model.digest:
