@@ -490,12 +490,16 @@ class Phases:
         # One that was hit, or that an impact elsewhere sends off.
         bounces = side * new > 0
         if bounces.any():
-            a = own.forward_dynamics(states, new, _rows(applied(force, t, q, out))[rows])
+            tau = _rows(applied(force, t, q, out))[rows]
+            a = own.forward_dynamics(states, new, tau)
             bound = np.where(side > 0, self._stops.bounds[0], np.where(side < 0, self._stops.bounds[1], 0.0))
             size = np.maximum(1.0, np.abs(bound))
-            ends = bounces & (side * a < 0) & (new**2 <= 2 * np.abs(a) * FLAT * size)
+            low = bounces & (new**2 <= 2 * np.abs(a) * FLAT * size)
+            if low.any():
+                # Low bounces on several stops keep each other up; together they rest where forces hold all of them.
+                ends = low & (own.forward_dynamics(states, np.where(low, 0.0, new), tau) == 0)
             if ends.any():
-                series = ends & hits & (e < 1)
+                series = ends & hits & (e < 1) & (side * a < 0)
                 delays = np.where(series, 2 * np.abs(new) / np.where(series, np.abs(a) * (1 - e), 1.0), 0.0)
                 _rows(out)[rows], _, left = over(self._own, own, states, new, ends)
         # What rows hold together with a stop rests too.
