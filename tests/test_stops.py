@@ -414,3 +414,34 @@ def test_a_run_with_impacts_has_its_energies_when_it_is_loaded(tmp_path: Path) -
     ]
     assert again.events[0].before is not None
     np.testing.assert_array_equal(again.work(), run.work())
+
+
+def test_low_bounces_on_two_stops_come_to_rest_together() -> None:
+    """Each keeps the other up at 1e-10 rad/s: a run went on with hits at every 1e-11 s."""
+    numbers = zip(
+        (0.54921817, 1.29413386, 0.47913855),
+        (0.45058098, 0.22642737, 0.55538039),
+        (0.03645416, 0.02515479, 0.03410424),
+        (0.75330186, 0.0, 0.93343847),
+        (0.0, 0.70768277, 0.48155176),
+        ((0.12755864, 0.90772461, 1.0), (-0.42614369, -0.03529701, 1.0), (-0.13102448, 0.39215834, 0.6)),
+        strict=True,
+    )
+    links = [
+        {
+            "mass": m,
+            "com": (0, 0, -c),
+            "inertia": (J, J, J),
+            "axis": (0, 1, 0),
+            "translation": (0, 0, -d),
+            "friction": f,
+        }
+        | {"lower": low, "upper": high, "stops": True, "restitution": e}
+        for m, c, J, f, d, (low, high, e) in numbers
+    ]
+    dyn = mb.dynamics(chain(*links).build(), "lagrangian")
+    start, v = np.array([0.33056252, -0.22408007, 0.28512146]), np.array([2.16624942, 0.0, 0.0])
+    for method, how in (("rk853", {"rtol": 1e-11}), ("rk4", {"dt": 1e-3})):
+        run = mb.simulate(dyn, start, v, 0.45, method=method, **how)
+        assert len(run.events) < 200
+        assert run.stats.ended == "finished"

@@ -40,7 +40,9 @@ _FORWARD: Final = "forward_dynamics"
 _MAX_ROUNDS: Final = 20_000
 #: Joints with friction whose rounds are machine code: 2 s are spent on 18 of them, and 9 s on 24.
 _MAX_COMPILED: Final = 18
-_UNDECIDED: Final = "dry friction: which of {n} joints at rest begin to move cannot be decided: singular inertia"
+_UNDECIDED: Final = (
+    "which of {n} joints at rest begin to move cannot be decided: singular inertia, or rows and stops that contradict"
+)
 
 
 def forces_at_rest(A: Array, b: Array, bound: Array) -> Array:

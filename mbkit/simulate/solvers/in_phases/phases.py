@@ -505,10 +505,12 @@ class Phases:
         # What rows hold together with a stop rests too.
         out = self.stopped(rubbed, t, q, out, out == 0)
         _rows(leaving)[rows] = 0.0
+        M = (own._bare or own).mass_matrix(states) if self._bound else None
+        whole = taken if M is None else 0.5 * np.einsum("ki,kij,kj->k", new - before, M, new + before)
         for k in np.flatnonzero(hits.any(axis=1)).tolist():
             first: Array | None = before[k]
-            # Of a stop that was not hit, and has a part in the impact, the first event tells.
-            others = float(np.where(hits[k], 0.0, taken[k]).sum())
+            # The first event tells of a stop that was not hit, and has a part in the impact, and of drives.
+            others = float(np.where(hits[k], 0.0, taken[k]).sum() if M is None else whole[k] - taken[k][hits[k]].sum())
             for i in np.flatnonzero(hits[k]).tolist():
                 name, row = partial(self._stops.event, i, side[k, i]), int(rows[k])
                 impacts.append(Impact(row, i, name(HITS), 0.0, new[k], first, float(taken[k, i]) + others))
