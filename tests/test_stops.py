@@ -12,7 +12,7 @@ import pytest
 
 import mbkit as mb
 from mbkit.engines.elements.stop_impacts import after_impacts
-from mbkit.errors import InputError, ModelError
+from mbkit.errors import InputError, MbkitWarning, ModelError
 from mbkit.model import Model
 from mbkit.model.stops import StopLaw
 from mbkit.simulate.solvers.in_phases import fixed
@@ -273,6 +273,17 @@ def test_stops_of_a_joint_that_follows_nothing_hold_nothing(method: str) -> None
     ]
     np.testing.assert_allclose(runs[0].q[-1], runs[1].q[-1], rtol=1e-8)
     assert not runs[0].events
+
+
+@pytest.mark.parametrize("method", ["rk853", "rk4"])
+def test_a_motion_that_leads_a_joint_beyond_its_stop_ends_the_run_with_its_name(method: str) -> None:
+    b = mb.ModelBuilder.of(slider(lower=-0.05, upper=0.05, stops=True).build())
+    b.prescribe("x", amplitude=0.1, frequency=3.0)
+    with pytest.warns(MbkitWarning, match="x is led beyond its upper stop by constraints, which no impact can stop"):
+        run = mb.simulate(mb.dynamics(b.build(), "lagrangian"), [0.0], [0.3], 0.3, method)
+    assert run.stats.ended == "diverged"
+    assert not run.events
+    assert run.q.max() <= 0.05
 
 
 def test_a_start_beyond_a_stop_is_refused_with_the_amount_and_projected() -> None:

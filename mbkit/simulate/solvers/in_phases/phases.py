@@ -484,6 +484,12 @@ class Phases:
             own, when = rubbed._of_samples(rows), t[rows] if isinstance(t, np.ndarray) else t
         own = at_time(own, when)
         states, before, side = (_rows(x)[rows] for x in (q, v, side))
+        if self._bound:
+            # What rows alone move has no response to impulses.
+            moved = np.linalg.norm(self._directions(own, when, states), axis=-1) < POSE_ROUNDING
+            for k, i in np.argwhere(moved & (side * before < -slow(before))).tolist():
+                does = self._stops.event(i, side[k, i], "is led beyond")
+                raise NumericalError(f"{does} by constraints, which no impact can stop")
         new, hits, taken = after_impacts(self._own, own, states, before)
         _rows(out)[rows] = new
         e, delays, ends, left = self._stops.restitution_at(side), np.zeros(new.shape), hits & False, taken
