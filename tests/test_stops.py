@@ -275,7 +275,7 @@ def test_stops_of_a_joint_that_follows_nothing_hold_nothing(method: str) -> None
     assert not runs[0].events
 
 
-@pytest.mark.parametrize("method", ["rk853", "rk4"])
+@pytest.mark.parametrize("method", ["rk853", "rk4", "moreau"])
 def test_a_motion_that_leads_a_joint_beyond_its_stop_ends_the_run_with_its_name(method: str) -> None:
     b = mb.ModelBuilder.of(slider(lower=-0.05, upper=0.05, stops=True).build())
     b.prescribe("x", amplitude=0.1, frequency=3.0)

@@ -112,6 +112,10 @@ class StopLaw:
         name, word = self.names[int(side < 0), i]
         return f"{name} {does} its {word} stop"
 
+    def led_beyond(self, i: int, side: float) -> str:
+        """Return why a run ends where rows alone move a velocity that its stop should hold."""
+        return f"{self.event(i, side, 'is led beyond')} by constraints, which no impact can stop"
+
     def beyond(self, q: Array) -> str:
         """Return which coordinates are beyond their stops, and by how much; empty where none is."""
         states = q.reshape(-1, q.shape[-1])

@@ -134,6 +134,7 @@ class _Stepper(Stepper):
         start, ends = q, holds & (side != 0)
         if ends.any():
             start, q1 = stops.onto(q, ends), stops.onto(q1, ends)
+            self._phases.require_response(dyn, t, q, smooth, side * ends)
             # What comes to a stop in this step moves what rows tie to it, also what rests then.
             holds = np.where((start != q).any(axis=1, keepdims=True), ends, holds)
         return self._phases.onto_rows(t + h, holds & (free == 0), start, q1, free) if bound else (q1, free)

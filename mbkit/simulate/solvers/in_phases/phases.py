@@ -484,12 +484,7 @@ class Phases:
             own, when = rubbed._of_samples(rows), t[rows] if isinstance(t, np.ndarray) else t
         own = at_time(own, when)
         states, before, side = (_rows(x)[rows] for x in (q, v, side))
-        if self._bound:
-            # What rows alone move has no response to impulses.
-            moved = np.linalg.norm(self._directions(own, when, states), axis=-1) < POSE_ROUNDING
-            for k, i in np.argwhere(moved & (side * before < -slow(before))).tolist():
-                does = self._stops.event(i, side[k, i], "is led beyond")
-                raise NumericalError(f"{does} by constraints, which no impact can stop")
+        self.require_response(own, when, states, before, side)
         new, hits, taken = after_impacts(self._own, own, states, before)
         _rows(out)[rows] = new
         e, delays, ends, left = self._stops.restitution_at(side), np.zeros(new.shape), hits & False, taken
@@ -525,6 +520,14 @@ class Phases:
                     last = float(delays[k, i]), _rows(out)[row], None, float(left[k, i])
                     impacts.append(Impact(row, i, name(RESTS), *last))
         return out, leaving, impacts
+
+    def require_response(self, dyn: Dynamics, t: float | Array, q: Array, v: Array, side: Array) -> None:
+        """Raise `NumericalError` where rows alone lead a velocity beyond its stop; states (m, ...)."""
+        if self._bound:
+            # What rows alone move has no response to impulses.
+            moved = np.linalg.norm(self._directions(dyn, t, q), axis=-1) < POSE_ROUNDING
+            for k, i in np.argwhere(moved & (side * v < -slow(v))).tolist():
+                raise NumericalError(self._stops.led_beyond(i, side[k, i]))
 
     def stopped(self, dyn: Dynamics, t: float | Array, q: Array, v: Array, rests: Mask) -> Array:
         """Return velocities of which some have come to rest, and with them those that constraints let rest too."""
