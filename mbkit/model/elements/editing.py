@@ -41,7 +41,8 @@ def restitution_of(read: Any, name: str, stops: object, restitution: Any) -> Any
     """Return the restitution of a joint's stops, None without; arguments that do not go together are faults."""
     if not isinstance(stops, (bool, np.bool_)):
         read.faults.append(f"joint {name!r}: stops: expected True or False, got {shown(stops)}")
-    elif restitution is not None and not stops:
+        return None
+    if restitution is not None and not stops:
         read.faults.append(f"joint {name!r}: restitution without stops; give stops=True too")
     return (0.0 if restitution is None else restitution) if stops else None
 
