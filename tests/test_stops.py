@@ -456,3 +456,10 @@ def test_low_bounces_on_two_stops_come_to_rest_together() -> None:
         run = mb.simulate(dyn, start, v, 0.45, method=method, **how)
         assert len(run.events) < 200
         assert run.stats.ended == "finished"
+
+
+def test_an_mjcf_says_of_limits_what_they_are_here() -> None:
+    model = slider(lower=-0.2, stops=True).build()
+    leaves_out = "which mbkit's terms leave out"
+    assert not any(leaves_out in x for x in mb.convert(model, "mjcf").notes)
+    assert any(leaves_out in x for x in mb.convert(model.without("stops"), "mjcf").notes)

@@ -53,6 +53,7 @@ def _notes(model: Model) -> Iterator[str]:
         yield f"principal moments of points and plates were lifted to what MuJoCo takes: {', '.join(lifted)}"
 
 
+_SOFT_LIMITS: Final = "MuJoCo acts on joint limits, softly, which mbkit's terms leave out"
 MJCF: Final = Path(
     "mjcf",
     "MJCF cannot say of",
@@ -61,7 +62,7 @@ MJCF: Final = Path(
     {
         "mimic": "mimic joints are free joints with equality constraints, which MuJoCo keeps softly",
         "row": "loops are equality constraints, which MuJoCo keeps softly",
-        "joint.limit": "MuJoCo acts on joint limits, softly, which mbkit's terms leave out",
+        "joint.limit": lambda model: "" if model.needs.stops else _SOFT_LIMITS,
         "joint.stop": AS_LIMITS,
         "joint.friction": f"MuJoCo's {EFFECTS['jump']} is soft; mbkit's holds exactly at rest",
         "joint.velocity_limit": "MJCF has no velocity limits",
