@@ -26,7 +26,7 @@ import scipy.linalg
 import sympy as sp
 
 import mbkit as mb
-from mbkit.codegen.c_source import HIT, export_c
+from mbkit.codegen.c_source import WITHOUT_STOPS, export_c
 from mbkit.errors import MbkitError, MbkitWarning, UnsupportedError
 from mbkit.lagrangian import from_model, program
 from mbkit.methods.registry import METHODS
@@ -833,7 +833,11 @@ def _c(x: Example, folder: Path) -> Told:
 
 def lacks_stops(x: Example, text: str) -> tuple[str, ...]:
     """Return the note of a text that has no stops; there are others, which hide nothing."""
-    return (HIT,) if "stop" in x.model.effects and HIT in " ".join(text.replace(" * ", " ").split()) else ()
+    return (
+        (WITHOUT_STOPS,)
+        if "stop" in x.model.effects and WITHOUT_STOPS in " ".join(text.replace(" * ", " ").split())
+        else ()
+    )
 
 
 @cache

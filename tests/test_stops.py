@@ -325,7 +325,7 @@ def test_stops_that_are_reached_within_the_digits_of_a_time_are_hit_at_once(monk
     run = mb.simulate(mb.dynamics(model, "lagrangian"), [0, 0], [0, 0], 0.5, method="rk853", rtol=1e-12)
     assert len({x.t for x in run.events}) == 1
     assert len(run.events) == 2
-    monkeypatch.setattr("mbkit.simulate.solvers.in_phases.phases.SIMULTANEOUS", 1e-14)
+    monkeypatch.setattr("mbkit.simulate.solvers.in_phases.phases._SIMULTANEOUS", 1e-14)
     run = mb.simulate(mb.dynamics(model, "lagrangian"), [0, 0], [0, 0], 0.5, method="rk853", rtol=1e-12)
     assert len({x.t for x in run.events}) == 2
 
@@ -463,3 +463,40 @@ def test_an_mjcf_says_of_limits_what_they_are_here() -> None:
     leaves_out = "which mbkit's terms leave out"
     assert not any(leaves_out in x for x in mb.convert(model, "mjcf").notes)
     assert any(leaves_out in x for x in mb.convert(model.without("stops"), "mjcf").notes)
+
+
+@pytest.mark.parametrize(("method", "how"), [("rk853", {}), ("rk4", {"dt": 1e-3})])
+def test_a_stop_at_a_singular_pose_ends_the_run_with_that_reason(method: str, how: dict[str, Any]) -> None:
+    b = mb.ModelBuilder.of(mb.catalog.four_bars(n=2))
+    b.set_joint("theta0", upper=np.pi / 2, stops=True)
+    dyn = mb.dynamics(b.build(), "lagrangian")
+    q, v = dyn.project(np.full(5, 0.3), np.zeros(5))
+    with pytest.warns(MbkitWarning, match="theta0 reaches its upper stop at a singular pose"):
+        run = mb.simulate(dyn, q, v, 1.0, method=method, **how)
+    assert run.stats.ended == "diverged"
+
+
+def test_limits_that_are_not_there_make_no_stops() -> None:
+    with pytest.raises(InputError, match="pendulum has no joint with limits that could act"):
+        mb.catalog.pendulum().with_stops()
+
+
+def test_forces_that_stops_share_are_told_to_be_one_solution() -> None:
+    free = mb.catalog.four_bar()
+    q, v = mb.dynamics(free).project([0.3, -0.3, 0.0], np.zeros(3), hold=["theta"])
+    b = mb.ModelBuilder.of(free)
+    b.set_joint("theta", upper=float(q[0]), stops=True)
+    alone = mb.dynamics(b.build(), "lagrangian").stop_forces(q, v, np.array([50.0, 0, 0]))
+    assert alone[0] < 0
+    assert (alone[1:] == 0).all()
+    side = np.sign(mb.dynamics(free).project(q, [1.0, 0, 0], hold=["theta"])[1][2])
+    b.set_joint("psi", **{"upper" if side > 0 else "lower": float(q[2])}, stops=True)
+    with pytest.warns(MbkitWarning, match="stop_forces: what holds theta and psi|what holds theta, psi at rest is one"):
+        mb.dynamics(b.build(), "lagrangian").stop_forces(q, v, np.array([50.0, 0, 0]))
+
+
+def test_dampers_lose_what_they_lose_up_to_a_hit_and_from_it_on() -> None:
+    model = slider(lower=0.0, stops=True, restitution=0.5, damping=2.0, gravity=(-9.81, 0, 0)).build()
+    run = mb.simulate(mb.dynamics(model, "lagrangian"), [1.0], [0.0], 2.0, method="dop853", rtol=1e-12)
+    assert sum("hits" in x.name for x in run.events) > 5
+    assert np.abs(run.power_balance()).max() < 1e-3

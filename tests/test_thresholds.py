@@ -646,8 +646,8 @@ DECIDES: dict[str, tuple[Callable[[Any], object], Any, Any]] = {
         32 * EPS,
         128 * EPS,
     ),
-    "simulate.solvers.in_phases.phases:FLAT": (bounces, 5e-12, 5e-11),
-    "simulate.solvers.in_phases.phases:SIMULTANEOUS": (hit_at_once, 5e-13, 5e-12),
+    "simulate.solvers.in_phases.phases:_LOWEST_BOUNCE": (bounces, 5e-12, 5e-11),
+    "simulate.solvers.in_phases.phases:_SIMULTANEOUS": (hit_at_once, 5e-13, 5e-12),
     "simulate.solvers.in_phases.moreau:_MAX_RESPONSES": (compiles_moreau, 200, 201),
     "simulate.solvers.in_phases.phases:POSE_ROUNDING": (lambda x: phases.slow(np.ones(1))[0] > x, 5e-10, 5e-9),
     "simulate.solvers.in_phases.phases:_FADED": (

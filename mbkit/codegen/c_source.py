@@ -46,9 +46,12 @@ _INPUTS: Final = {
 }
 
 _HOLD: Final = "constraints hold accelerations at states that satisfy them; all other terms are those without them"
-HIT: Final = "joint stops are in no term: neither the forces that they push with, nor impacts on them"
+WITHOUT_STOPS: Final = "joint stops are in no term: neither the forces that they push with, nor impacts on them"
 C_CODE: Final = paths.Path(
-    "c", "export_c: not known of", paths.ALL, notes={"jump": held_at_rest, "row": _HOLD, "speed": _HOLD, "stop": HIT}
+    "c",
+    "export_c: not known of",
+    paths.ALL,
+    notes={"jump": held_at_rest, "row": _HOLD, "speed": _HOLD, "stop": WITHOUT_STOPS},
 )
 #: Data of a description that no function holds.
 _LEFT_OUT: Final = ("limits", "effort_limits")

@@ -360,7 +360,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         """Return the generalized forces of joint stops under τ, N m or N, shape (nv,) or (N, nv).
 
         They are above zero at lower stops and below at upper ones, and zero where nothing rests on a stop. A force that
-        dry friction of the same joint could hold counts as the stop's.
+        dry friction of the same joint could hold counts as the stop's. Where joints share them beside constraints, they
+        are one solution of many, with a warning.
 
         Examples
         --------
@@ -372,7 +373,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         >>> dyn.forward_dynamics([0.0], [0.0], [1.0]), dyn.stop_forces([0.0], [0.0], [1.0]).round(9)
         (array([0.]), array([18.62]))
         """
-        return self._evaluate("stop_forces", q=q, v=v, tau=tau)
+        of_state = self._reactions if self.model.constrained else self._evaluate
+        return of_state("stop_forces", q=q, v=v, tau=tau)
 
     def _stop_forces(self, q: Array, v: Array, tau: Array) -> Array:
         return self._jumps.stop_forces(self, q, v, tau)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, count, finite_array, is_on_device, on_host, real
 from mbkit.codegen.backend import DERIVING, Machine, compile_by_default, executable, has_compiler
-from mbkit.codegen.c_source import HIT
+from mbkit.codegen.c_source import WITHOUT_STOPS
 from mbkit.derivation import ELIMINATIONS, Elimination, Equations, elimination_of, equations_of
 from mbkit.derivation.body_motion import BODY_QUANTITIES
 from mbkit.derivation.least_constraint import has_squares
@@ -564,7 +564,7 @@ class LagrangianDynamics(Derived):
         f = self.equations.function(name, frame, axes, kind)
         given = f.sx_in()
         if "stop" in self.model.effects and "tau" in f.name_in():
-            warn(f"{self.model.name}: {name}: {HIT}", MbkitWarning)
+            warn(f"{self.model.name}: {name}: {WITHOUT_STOPS}", MbkitWarning)
         # Users inline and differentiate it: small is worth a search.
         return ca.Function(name, given, f.call(given), f.name_in(), f.name_out(), {"cse": True})
 

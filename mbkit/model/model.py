@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import TWO_TURNS, Array, batch_of, count, generator, hint_at_degrees, real, rows
 from mbkit._escape import html
 from mbkit._imports import from_above
-from mbkit.errors import MbkitWarning, ModelError, UnknownNameError, UnsupportedError, require_known, warn
+from mbkit.errors import InputError, MbkitWarning, ModelError, UnknownNameError, UnsupportedError, require_known, warn
 from mbkit.model import manifold
 from mbkit.model.base_parameters import TOLERANCE, BaseParameters, base_parameters, regressor_columns
 from mbkit.model.description import SERVOS, Description, expect_name
@@ -317,16 +317,17 @@ class Model(Description):
     def with_stops(self, restitution: float = 0.0) -> Model:
         """Return the model in which the limits of all joints act as rigid stops, with Newton's restitution.
 
-        Limits of free and ball joints stay data.
+        Limits of free and ball joints stay data; InputError where no joint has others.
         """
-        e, finite = real("restitution", restitution), np.isfinite
-        joints = (
-            replace(j, restitution=np.full(j.type.nv, e))
-            if j.type.nv and j.type.coordinate_velocities and finite([j.lower, j.upper]).any()
-            else j
+        e = real("restitution", restitution)
+        stopped = {
+            j.name: replace(j, restitution=np.full(j.type.nv, e))
             for j in self.joints
-        )
-        return replace(self, joints=tuple(joints))
+            if j.type.coordinate_velocities and np.isfinite([j.lower, j.upper]).any()
+        }
+        if not stopped:
+            raise InputError(f"stops: {self.name} has no joint with limits that could act; give lower, upper or both")
+        return replace(self, joints=tuple(stopped.get(j.name, j) for j in self.joints))
 
     @property
     def smooth(self) -> Model:

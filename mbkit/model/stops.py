@@ -90,7 +90,7 @@ class StopLaw:
         low, high = np.moveaxis(self.distance(q) < -self.room, -2, 0)
         return np.asarray(low * 1.0 - high)
 
-    def left(self, q: Array, v: Array) -> Array:
+    def clearance(self, q: Array, v: Array) -> Array:
         """Return the distance from the nearest stop, (..., nv): above zero by rounding where v leads inwards."""
         inwards = v[..., None, :] * np.array([[1.0], [-1.0]]) >= 0
         return np.asarray((self.distance(q) + np.where(inwards, 0.5 * self.room, 0.0)).min(axis=-2))
@@ -116,18 +116,21 @@ class StopLaw:
         """Return why a run ends where rows alone move a velocity that its stop should hold."""
         return f"{self.event(i, side, 'is led beyond')} by constraints, which no impact can stop"
 
+    def singular(self, i: int, side: float) -> str:
+        """Return why a run ends at a stop where rows of constraints depend on each other."""
+        return f"{self.event(i, side, 'reaches')} at a singular pose, where it is not known what the impact does"
+
     def beyond(self, q: Array) -> str:
         """Return which coordinates are beyond their stops, and by how much; empty where none is."""
-        states = q.reshape(-1, q.shape[-1])
-        over = -(self.distance(states) + self.room)
-        told = []
-        for n, side, i in np.argwhere(over > 0).tolist():
+        over = -self.distance(q.reshape(-1, q.shape[-1]))
+        sentences = []
+        for n, side, i in np.argwhere(over > self.room).tolist():
             name, word = self.names[side, i]
             of = f"trajectory {n}: " if q.ndim > 1 else ""
-            amount = -float(self.distance(states)[n, side, i])
-            told.append(f"{of}{name} is {amount:.6g} beyond its {word} stop at {self.bounds[side, i]:.6g}")
-        more = f", and {len(told) - 3} more" if len(told) > 3 else ""
-        return "; ".join(told[:3]) + more
+            amount, bound = float(over[n, side, i]), self.bounds[side, i]
+            sentences.append(f"{of}{name} is {amount:.6g} beyond its {word} stop at {bound:.6g}")
+        more = f", and {len(sentences) - 3} more" if len(sentences) > 3 else ""
+        return "; ".join(sentences[:3]) + more
 
 
 def stop_faults(model: Description) -> Iterator[str]:

@@ -44,11 +44,8 @@ def exchange_rounds(n: int, *, stops: bool) -> ca.Function:
     state += [ca.SX.sym(name) for name in Signs._fields[4:6]]
     more: list[Any] = [ca.SX.sym(name, n) for name in Problem._fields[9:]] if stops else []
     A = ca.reshape(square, n, n)
-    problem, signs, out = (
-        Problem._make([A, A, *given, None, *(more or (None, None))]),
-        Signs._make([*state, ca.SX(n, 1)]),
-        list[Any](),
-    )
+    problem = Problem._make([A, A, *given, None, *(more or (None, None))])
+    signs, out = Signs._make([*state, ca.SX(n, 1)]), list[Any]()
     for _ in range(ROUNDS):
         signs, *out = exchange(COLUMNS, problem, signs, n)
     return ca.Function("exchange_rounds", [square, *given, *more, *state], [ca.densify(x) for x in (*signs[:6], *out)])

@@ -61,8 +61,8 @@ def phase_margin(
             *(lock <= 0 if x is None else values[place[x]] for x, lock in zip(sides, ca.vertsplit(locked), strict=True))
         )
         locked = locked >= RESTING
-        rubs, ends = bound > 0, ca.DM(stops.which[list(which)].astype(float))
-        still = (side == 0) * (1 - (1 - rubs) * (1 - ends))
+        rubs, stopped = bound > 0, ca.DM(stops.which[list(which)].astype(float))
+        still = (side == 0) * (1 - (1 - rubs) * (1 - stopped))
         pick = ca.DM(ca.Sparsity.triplet(len(which), model.nv, list(range(len(which))), list(which)), 1.0)
         ends = space.to_body_velocity(q, w)
         rests = ca.mtimes(pick.T, still)
@@ -92,7 +92,7 @@ def phase_margin(
                 size = reduce(ca.fmax, ca.vertsplit(size), ca.SX(np.finfo(float).tiny))
                 held = bound - pushed * RESTING * ca.mtimes(pick, a)
                 left = choose(pushed != 0, held / (bound + size) + ROUNDING, left)
-            loose = ca.fmin(loose, ca.vertcat(*(_from_stops(stops, i, q, v[int(i)]) for i in which)))
+            loose = ca.fmin(loose, ca.vertcat(*(_clearance(stops, i, q, v[int(i)]) for i in which)))
         margins = choose(still, left, loose)
         results = [reduce(ca.fmin, ca.vertsplit(margins)), margins]
         results += [choose(_places(model, rests), start, q), choose(rests, 0.0, w)]
@@ -109,8 +109,8 @@ def _against(stops: StopLaw, i: int, q: Any) -> Any:
     return (low <= 0) - (high <= 0)
 
 
-def _from_stops(stops: StopLaw, i: int, q: Any, v: Any) -> Any:
-    """Return the distance from the nearest stop, as `StopLaw.left` does."""
+def _clearance(stops: StopLaw, i: int, q: Any, v: Any) -> Any:
+    """Return the distance from the nearest stop, as `StopLaw.clearance` does."""
     rooms, inwards = 0.5 * stops.room[:, i], (v >= 0, v <= 0)
     return reduce(ca.fmin, (x + r * on for x, r, on in zip(_distances(stops, i, q), rooms, inwards, strict=True)))
 

@@ -160,7 +160,7 @@ class EditingBuilder:
             return
         given = self._known(f"joint {joint.name!r}", numbers, NUMBERS_OF_JOINTS)
         if stops is not None or "restitution" in given:
-            there = joint.restitution is not None if stops is None else stops
+            there = joint.stops if stops is None else stops
             given["restitution"] = restitution_of(self._read, name, there, given.get("restitution"))
         given |= {"axes": None if axis is None and axis2 is None else (axis, axis2)}
         given |= {} if mimic is ... else {"mimic": mimic}

@@ -252,7 +252,7 @@ register_kind("bodies", "body.rotor", _WORDS, "T", "mass inertia", "armature", _
 _AT, _FRICTION = lambda _, j: j.mimic is not None, "friction stiction stribeck_velocity"
 register_kind("joints", "mimic", "joint {p.name!r} follows {p.mimic.joint!r}", "q", at=_AT)
 _stop = partial(register_kind, "joints", "joint.stop", "joint {p.name!r} has stops", "jump stop", "restitution")
-_stop("limits stops", lambda _, j: j.restitution is not None)
+_stop("limits stops", lambda _, j: j.stops)
 for _name, _what, _does, _numbers, _feature in (
     ("armature", "armature", "T", "armature", "armature"),
     ("spring", "a spring", "V", "stiffness", "springs"),

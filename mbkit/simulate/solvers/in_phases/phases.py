@@ -22,11 +22,11 @@ from scipy.optimize import linprog
 from scipy.sparse.csgraph import connected_components
 
 from mbkit._check import EPS, Array
-from mbkit._reproducible import pivoted
+from mbkit._reproducible import pivoted, unit_rows
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
 from mbkit.engines.elements.jumps import Mask
-from mbkit.engines.elements.stop_impacts import after_impacts, over
+from mbkit.engines.elements.stop_impacts import StopImpacts, after_impacts, over
 from mbkit.errors import NumericalError
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import ALL, Path
@@ -41,10 +41,10 @@ from mbkit.simulate.torque import Force, Torque
 #: Part of a motion that is left where it stops, by the rounding of late times; at a dead centre all of it is.
 _LEFT: Final = 1e-3
 #: Time within which stops are reached at once, relative to times of 1 s or more: less than the error of any run.
-SIMULTANEOUS: Final = 1e-12
+_SIMULTANEOUS: Final = 1e-12
 #: Height of the last bounce, rad or m, relative to coordinates of 1 or more: of lower ones the rounding of coordinates
 #: would move the times more than their sum is.
-FLAT: Final = 1e-11
+_LOWEST_BOUNCE: Final = 1e-11
 #: Acceleration, relative to speeds of 1 or more: a speed that fades as c s², s before its end, is zero by rounding from
 #: where its rate is 2 √(c eps).
 _FADED: Final = 8 * float(np.sqrt(EPS))
@@ -229,7 +229,7 @@ def in_order(events: Sequence[Hit], end: float) -> list[Hit]:
     """
     ends, gone = dict[tuple[int | None, str], int](), set[int]()
     for k, x in enumerate(events):
-        rests = x.name.replace(f" {HITS} ", f" {RESTS} ")
+        rests = x.name.replace(f" {HITS} its ", f" {RESTS} its ")
         own = x.member, rests
         if rests == x.name:
             ends[own] = k
@@ -386,7 +386,7 @@ class Phases:
             along, loose = along[:, None], loose[:, None]
         out = np.where(along == 0, 1.0, along * v[..., self.which] - STOPPED)
         if self._stops:
-            out = np.where(loose, np.minimum(out, self._stops.left(q, v)[..., self.which]), out)
+            out = np.where(loose, np.minimum(out, self._stops.clearance(q, v)[..., self.which]), out)
         return np.asarray(out)
 
     def margin_part(self, dyn: Any) -> Any:
@@ -461,7 +461,7 @@ class Phases:
 
     def _arriving(self, t: float | Array, q: Array, v: Array) -> Mask:
         """Return which velocities lead to stops that are reached now, within the digits of a time."""
-        near = SIMULTANEOUS * np.maximum(1.0, np.abs(np.asarray(t)))[..., None, None]
+        near = _SIMULTANEOUS * np.maximum(1.0, np.abs(np.asarray(t)))[..., None, None]
         speed = v[..., None, :] * np.array([[-1.0], [1.0]])
         reached = self._stops.distance(q) <= self._stops.room + near * np.maximum(speed, 0.0)
         return np.asarray((reached & (speed > 0)).any(axis=-2))
@@ -474,60 +474,67 @@ class Phases:
         Bounces that are lower than rounding are over, at the time to which their times add up.
         """
         leaving, side = np.zeros(v.shape) if leaving is None else leaving, self._stops.against(q)
-        impacts: list[Impact] = []
-        out, every = v.copy(), _rows(side * v)
-        rows: Any = np.flatnonzero((every < 0).any(axis=1))
+        rows: Any = np.flatnonzero((_rows(side * v) < 0).any(axis=1))
         if not len(rows):
-            return v, leaving, impacts
-        own, when = rubbed, t
+            return v, leaving, []
+        own, when, out = rubbed, t, v.copy()
         if self._side_by_side:
             own, when = rubbed._of_samples(rows), t[rows] if isinstance(t, np.ndarray) else t
         own = at_time(own, when)
         states, before, side = (_rows(x)[rows] for x in (q, v, side))
         self.require_response(own, when, states, before, side)
-        new, hits, taken = after_impacts(self._own, own, states, before)
-        _rows(out)[rows] = new
-        e, delays, ends, left = self._stops.restitution_at(side), np.zeros(new.shape), hits & False, taken
-        # One that was hit, or that an impact elsewhere sends off.
-        bounces = side * new > 0
-        if bounces.any():
-            tau = _rows(applied(force, t, q, out))[rows]
-            a = own.forward_dynamics(states, new, tau)
-            bound = np.where(side > 0, self._stops.bounds[0], np.where(side < 0, self._stops.bounds[1], 0.0))
-            size = np.maximum(1.0, np.abs(bound))
-            low = bounces & (new**2 <= 2 * np.abs(a) * FLAT * size)
-            if low.any():
-                # Low bounces on several stops keep each other up; together they rest where forces hold all of them.
-                ends = low & (own.forward_dynamics(states, np.where(low, 0.0, new), tau) == 0)
-            if ends.any():
-                series = ends & hits & (e < 1) & (side * a < 0)
-                delays = np.where(series, 2 * np.abs(new) / np.where(series, np.abs(a) * (1 - e), 1.0), 0.0)
-                _rows(out)[rows], _, left = over(self._own, own, states, new, ends)
+        impact = after_impacts(self._own, own, states, before)
+        _rows(out)[rows] = impact.v
+        tau = _rows(applied(force, t, q, out))[rows]
+        ends, delays = self._last_bounces(own, states, impact, side, tau)
+        last = over(self._own, own, states, impact.v, ends) if ends.any() else impact
+        _rows(out)[rows] = last.v
         # What rows hold together with a stop rests too.
         out = self.stopped(rubbed, t, q, out, out == 0)
         _rows(leaving)[rows] = 0.0
         M = (own._bare or own).mass_matrix(states) if self._bound else None
-        whole = taken if M is None else 0.5 * np.einsum("ki,kij,kj->k", new - before, M, new + before)
-        for k in np.flatnonzero(hits.any(axis=1)).tolist():
-            first: Array | None = before[k]
+        impacts: list[Impact] = []
+        for k in np.flatnonzero(impact.hit.any(axis=1)).tolist():
+            row, new, energy = int(rows[k]), impact.v[k], impact.energy_change[k]
+            whole = energy.sum() if M is None else 0.5 * (new - before[k]) @ M[k] @ (new + before[k])
             # The first event tells of a stop that was not hit, and has a part in the impact, and of drives.
-            others = float(np.where(hits[k], 0.0, taken[k]).sum() if M is None else whole[k] - taken[k][hits[k]].sum())
-            for i in np.flatnonzero(hits[k]).tolist():
-                name, row = partial(self._stops.event, i, side[k, i]), int(rows[k])
-                impacts.append(Impact(row, i, name(HITS), 0.0, new[k], first, float(taken[k, i]) + others))
-                first, others = None, 0.0
-                if ends[k, i] and e[k, i]:
-                    last = float(delays[k, i]), _rows(out)[row], None, float(left[k, i])
-                    impacts.append(Impact(row, i, name(RESTS), *last))
+            first: Array | None = before[k]
+            more = float(whole - energy[impact.hit[k]].sum())
+            for i in np.flatnonzero(impact.hit[k]).tolist():
+                name = partial(self._stops.event, i, side[k, i])
+                impacts.append(Impact(row, i, name(HITS), 0.0, new, first, float(energy[i]) + more))
+                first, more = None, 0.0
+                if ends[k, i] and self._stops.restitution_at(side[k])[i]:
+                    left = float(delays[k, i]), _rows(out)[row], None, float(last.energy_change[k, i])
+                    impacts.append(Impact(row, i, name(RESTS), *left))
         return out, leaving, impacts
+
+    def _last_bounces(
+        self, own: Dynamics, q: Array, impact: StopImpacts, side: Array, tau: Array
+    ) -> tuple[Mask, Array]:
+        """Return which bounces are too low to go on, and the s after which their series end; states (m, ...)."""
+        v, e = impact.v, self._stops.restitution_at(side)
+        # One that was hit, or that an impact elsewhere sends off.
+        bounces = side * v > 0
+        if not bounces.any():
+            return bounces, np.zeros(v.shape)
+        a = own.forward_dynamics(q, v, tau)
+        bound = np.where(side > 0, self._stops.bounds[0], np.where(side < 0, self._stops.bounds[1], 0.0))
+        low = bounces & (v**2 <= 2 * np.abs(a) * _LOWEST_BOUNCE * np.maximum(1.0, np.abs(bound)))
+        # Low bounces on several stops keep each other up; together they rest where forces hold all of them.
+        ends = low & (own.forward_dynamics(q, np.where(low, 0.0, v), tau) == 0) if low.any() else low
+        series = ends & impact.hit & (e < 1) & (side * a < 0)
+        return ends, np.where(series, 2 * np.abs(v) / np.where(series, np.abs(a) * (1 - e), 1.0), 0.0)
 
     def require_response(self, dyn: Dynamics, t: float | Array, q: Array, v: Array, side: Array) -> None:
         """Raise `NumericalError` where rows alone lead a velocity beyond its stop; states (m, ...)."""
         if self._bound:
-            # What rows alone move has no response to impulses.
+            # What rows alone move has no response to impulses; at a singular pose nothing seems to have one.
             moved = np.linalg.norm(self._directions(dyn, t, q), axis=-1) < POSE_ROUNDING
             for k, i in np.argwhere(moved & (side * v < -slow(v))).tolist():
-                raise NumericalError(self._stops.led_beyond(i, side[k, i]))
+                J = unit_rows(at_time(dyn, t).constraint_jacobian(q)[k, list(dyn._row_choice.independent)])
+                singular = np.linalg.matrix_rank(J, POSE_ROUNDING) < len(J)
+                raise NumericalError((self._stops.singular if singular else self._stops.led_beyond)(i, side[k, i]))
 
     def stopped(self, dyn: Dynamics, t: float | Array, q: Array, v: Array, rests: Mask) -> Array:
         """Return velocities of which some have come to rest, and with them those that constraints let rest too."""
