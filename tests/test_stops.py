@@ -493,3 +493,10 @@ def test_forces_that_stops_share_are_told_to_be_one_solution() -> None:
     b.set_joint("psi", **{"upper" if side > 0 else "lower": float(q[2])}, stops=True)
     with pytest.warns(MbkitWarning, match="stop_forces: what holds theta and psi|what holds theta, psi at rest is one"):
         mb.dynamics(b.build(), "lagrangian").stop_forces(q, v, np.array([50.0, 0, 0]))
+
+
+def test_dampers_lose_what_they_lose_up_to_a_hit_and_from_it_on() -> None:
+    model = slider(lower=0.0, stops=True, restitution=0.5, damping=2.0, gravity=(-9.81, 0, 0)).build()
+    run = mb.simulate(mb.dynamics(model, "lagrangian"), [1.0], [0.0], 2.0, method="dop853", rtol=1e-12)
+    assert sum("hits" in x.name for x in run.events) > 5
+    assert np.abs(run.power_balance()).max() < 1e-3

@@ -302,7 +302,7 @@ class RunData:
                 steps = self._by_phases(dyn, lost)
             else:
                 held = np.zeros(self._numbers) if force is None else force.between(t)
-                steps = _of_held(dyn, np.diff(t), q, v, held, self._acting)
+                steps = _of_held(dyn, np.diff(t), q, (v[..., :-1, :], self._arrivals), held, self._acting)
         if "jump" in self.model.effects and not dyn._soft_jumps:
             steps = steps - self._rubbed(dyn) + self._struck
         out = np.zeros(q.shape[:-1])
@@ -344,6 +344,15 @@ class RunData:
             taken = np.append(0.0, np.cumsum(law.dissipated(np.diff(times[order]), moved, speeds)))
             out[i] = np.diff(taken[np.argsort(order)[len(hits) :]])
         return out.reshape(*self.q.shape[:-2], -1)
+
+    @property
+    def _arrivals(self) -> Array:
+        """The velocities at the end of each interval, (..., K - 1, nv): before an impact that is at the saved time."""
+        out, place = self.v[..., 1:, :].copy(), {x: k for k, x in enumerate(self.t[1:].tolist())}
+        for x in self.events:
+            if x.before is not None and x.t in place:
+                out[... if x.member is None else x.member, place[x.t], :] = x.before
+        return out
 
     @property
     def _struck(self) -> Array:
@@ -447,10 +456,10 @@ def _quadratic(dyn: Dynamics, q: Array, v: Array) -> Array:
 # at the states alone is integrated by the cubic through four of them.
 
 
-def _of_held(dyn: Dynamics, h: Array, q: Array, v: Array, held: Array, acting: Acting | None) -> Array:
-    """Return the work in each interval, of a force and wrenches that are constant there."""
-    nv = v.shape[-1]
-    held = np.broadcast_to(held, (*v.shape[:-2], len(h), held.shape[-1]))
+def _of_held(dyn: Dynamics, h: Array, q: Array, v: tuple[Array, Array], held: Array, acting: Acting | None) -> Array:
+    """Return the work in each interval, of a force and wrenches that are constant there; v are those at its ends."""
+    nv = v[0].shape[-1]
+    held = np.broadcast_to(held, (*v[0].shape[:-1], held.shape[-1]))
     pushed, wrenches = held[..., :nv], held[..., nv:]
     coordinates, plain = np.array(_plain(dyn.model), dtype=int).reshape(-1, 2).T
     model = dyn.model
@@ -460,14 +469,14 @@ def _of_held(dyn: Dynamics, h: Array, q: Array, v: Array, held: Array, acting: A
     # Forces that jump keep their sides up to the states in which they change them, and what rests is held up to there.
     sides, keeps = np.zeros(pushed.shape), np.zeros(pushed.shape, dtype=bool)
     sides[..., plain], keeps[..., plain] = np.sign(moved), jumps
-    keeps &= (sides * v[..., :-1, :] >= 0) & (sides * v[..., 1:, :] >= 0)
-    keeps &= (sides != 0) | ((v[..., :-1, :] == 0) & (v[..., 1:, :] == 0))
+    keeps &= (sides * v[0] >= 0) & (sides * v[1] >= 0)
+    keeps &= (sides != 0) | ((v[0] == 0) & (v[1] == 0))
 
     def sided(v: Array) -> Array:
         return np.where(keeps, sides * np.maximum(sides * v, np.finfo(float).tiny), v)
 
-    ends = [(q[..., i : len(h) + i, :], sided(v[..., i : len(h) + i, :])) for i in (0, 1)]
-    owns = [_at_end(dyn, v.shape[:-1], i) for i in (0, 1)]
+    ends = [(q[..., i : len(h) + i, :], sided(v[i])) for i in (0, 1)]
+    owns = [_at_end(dyn, q.shape[:-1], i) for i in (0, 1)]
     a = [np.zeros(0)] * 2
     if losing or turned:
         forces = [_generalized(own, end[0], held, acting) for own, end in zip(owns, ends, strict=True)]
