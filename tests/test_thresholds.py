@@ -699,6 +699,11 @@ DECIDES: dict[str, tuple[Callable[[Any], object], Any, Any]] = {
     "studies.lint.checks:LIKELY_FROM": (lambda x: lint.checks._confidence(x) == lint.checks.LOOK, 2.0, 4.0),
     "studies.lint.checks:SURE_FROM": (lambda x: lint.checks._confidence(x) == lint.checks.SURE, 20.0, 40.0),
     "studies.lint.checks:MIN_COPIES": (copied, 2, 3),
+    "studies.soft_stops:_TOUCHES": (
+        lambda x: bool(mb.soft_stops(slider(gravity=(0, 0, 0), upper=0.0).build(), [-x], [0.0], duration=0.01).rows),
+        5e-7,
+        5e-6,
+    ),
     "studies.measurement:GROSS": (lambda x: Measurement(1.0, error=x).outcome(1e-6), 5e-3, 5e-2),
     "studies.stress.study:_MAX_FAILURES_IN_A_ROW": (stops_after, 1, 2),
     "studies.stress.measurements:_MIN_PREPARATION_SECONDS": (lambda x: preparation(0.0) > x, 5.0, 7.0),

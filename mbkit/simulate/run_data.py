@@ -291,8 +291,9 @@ class RunData:
         where its rows change between two saved states. So is that of a force f that jumps, ``f |Δq|`` from one stop or
         turn in `events` to the next. All else, also torque on quasi-velocities, is a quadrature of fourth order in the
         distance of the saved states, of second order in an interval with a turn or stop of theirs; a function that
-        jumps makes it first order, and so do rows that jump beside a function and impacts on joint stops within an
-        interval. The energy of these impacts is that of `events`; moreau tells none, and leaves it in `power_balance`.
+        jumps makes it first order, and so do rows that jump beside a function. So do impacts on joint stops within an
+        interval, and beside a function of the state. Their energy is that of `events`; moreau tells none, and leaves it
+        in `power_balance`.
         """
         dyn, force, t, q, v = self._by(engine), self._acted(), self.t, self.q, self.v
         with unwatched(dyn):
